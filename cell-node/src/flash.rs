@@ -52,22 +52,22 @@ pub enum FlashState {
 #[non_exhaustive]
 pub enum FlashError {
     /// The image has a size that no image can have.
-    #[error("the image has {got} bytes, not {BYTES} to {MAX_BYTES}")]
+    #[error("the flash image has {got} bytes, not {BYTES} to {MAX_BYTES}")]
     Size {
         /// Size of the image in bytes.
         got: usize,
     },
     /// The CRC of the image is wrong.
-    #[error("the CRC of the image is wrong")]
+    #[error("the CRC of the flash image is wrong")]
     Damaged,
     /// The version of the image is unknown.
-    #[error("the image has version {got}, not {VERSION}")]
+    #[error("the flash image has version {got}, not {VERSION}")]
     Version {
         /// The version of the image.
         got: u8,
     },
     /// The image belongs to another cell.
-    #[error("the image belongs to cell {cell} with serial number {serial}")]
+    #[error("the flash image belongs to cell {cell} with serial number {serial}")]
     OtherCell {
         /// Node id of the other cell, 0 for none.
         cell: u8,
@@ -75,7 +75,7 @@ pub enum FlashError {
         serial: u32,
     },
     /// The parameters in the image are invalid.
-    #[error("the parameters in the image are invalid: {0}")]
+    #[error("the parameters in the flash image are invalid: {0}")]
     Parameters(#[from] protocol::parameters::ParameterError),
 }
 

@@ -14,11 +14,11 @@ use protocol::last_words::{CellRange, ExitReason};
 use protocol::skin::{BusWires, Skin, SkinReply};
 use rustix::process::{Pid, Signal, getppid, set_parent_process_death_signal};
 
-/// A tactile skin cell: receives joint positions, answers with its joint torques.
+/// Run one or several tactile skin cells, which receive joint positions and answer with joint torques
 #[derive(Debug, Parser)]
 #[command(
     version,
-    after_help = "Embedded buses lie in $SKINBUS_DIR, else $XDG_RUNTIME_DIR/skinbus, else /tmp/skinbus-UID.
+    after_help = "Sockets of embedded buses are in $SKINBUS_DIR, else $XDG_RUNTIME_DIR/skinbus, else /tmp/skinbus-UID.
 
 Examples:
   cell-node --bus vcan0 --node 12 --skin gateway/examples/ur5-253.toml
@@ -26,26 +26,26 @@ Examples:
   cell-node --bus vcan0 --node 12 --skin skin.toml --fresh --flash /tmp/flash"
 )]
 struct Arguments {
-    /// Name of the bus, one of the skin's buses
+    /// Name of the bus, which must be one of the buses in the skin file
     #[arg(long, value_name = "NAME")]
     bus: String,
-    /// The cell's node id on the bus, 1 to 254
+    /// Node id of the cell on the bus, 1 to 254
     #[arg(long, value_name = "N", required_unless_present = "nodes")]
     node: Option<u8>,
-    /// Run several cells in one process over one socket: first and last node id
+    /// Run several cells in one process over one socket; give the first and last node id
     #[arg(long, value_name = "A-B", conflicts_with = "node", value_parser = parse_range)]
     nodes: Option<(u8, u8)>,
-    /// The skin's description; a cell whose flash is empty takes its parameters from it
+    /// Skin file; a cell with empty flash gets its parameters from it
     #[arg(long, value_name = "FILE")]
     skin: PathBuf,
-    /// Keep parameters in files in this directory; without it, cells forget them when they end
+    /// Keep the parameters of cells in files in this directory; without it, they are lost when the process ends
     #[arg(long, value_name = "DIR")]
     flash: Option<PathBuf>,
-    /// Start as from the factory: without parameters and, on a bus with sums, without a node id; the network and
-    /// `skinbus commission` assign these. What --flash already contains is used
+    /// Start cells as they leave the factory: without parameters and, on a bus with sums, without a node id;
+    /// `skinbus commission` and the network assign these. Contents of existing --flash files are used
     #[arg(long)]
     fresh: bool,
-    /// Reopen the bus when it is lost, and wait for it at the start, instead of exiting
+    /// Wait for the bus at the start, and reopen it when it is lost, instead of exiting
     #[arg(long)]
     reconnect: bool,
     #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto, help = BusKind::help())]
@@ -60,7 +60,7 @@ fn parse_range(text: &str) -> Result<(u8, u8), String> {
         text.split_once('-').and_then(|(first, last)| Some((first.parse().ok()?, last.parse().ok()?)));
     node_ids
         .filter(|&(first, last)| 1 <= first && first <= last && last <= CellId::MAX.get())
-        .ok_or_else(|| "two node ids of 1 to 254, the smaller one first, such as 1-64".to_owned())
+        .ok_or_else(|| "give two node ids from 1 to 254, the smaller one first, such as 1-64".to_owned())
 }
 
 impl Arguments {
@@ -124,10 +124,13 @@ fn prepare_cells(arguments: &Arguments) -> Result<(HostedCells, Sockets, BusPort
         // A stopped process would not receive SIGTERM before it is continued.
         set_parent_process_death_signal(Some(Signal::KILL))?;
         // The parent may have ended before that call.
-        ensure!(getppid() == Pid::from_raw(parent), "process {parent} is not the parent of this one");
+        ensure!(
+            getppid() == Pid::from_raw(parent),
+            "--with-parent: process {parent} is not the parent of this process"
+        );
     }
     if let Some(flash) = arguments.flash.as_deref().filter(|flash| !flash.is_dir()) {
-        bail!("--flash {}: there is no such directory; make it first", flash.display());
+        bail!("--flash {}: this directory does not exist; create it first", flash.display());
     }
     let skin = Skin::read_for_bus(&arguments.skin, &arguments.bus)?;
     let bus_index = skin.bus_index(&arguments.bus).with_context(|| {
@@ -154,7 +157,7 @@ fn prepare_cells(arguments: &Arguments) -> Result<(HostedCells, Sockets, BusPort
         Err(StopReason::Bus(error)) if line.reconnect && error.may_open_later() => {
             // The program that started hundreds of cells reports it.
             if arguments.with_parent.is_none() {
-                eprint_line(format_args!("{error}; waiting for it"));
+                eprint_line(format_args!("{error}; waiting for the bus"));
             }
             cells.reopen_sockets(&line)?
         }
@@ -193,7 +196,9 @@ fn start_cell(
         }
         Err(damage) => {
             let name = file.name();
-            eprint_line(format_args!("{name} is not used: {damage}; write it again or delete the file"));
+            eprint_line(format_args!(
+                "{name} is not used: {damage}; commission the cell again, or delete the file"
+            ));
             FlashState::Damaged
         }
     };

@@ -1,87 +1,92 @@
 //! Sine and cosine of an angle in quarter turns, with integers only.
 //!
 //! An angle is a Q1.14 word in quarter turns (paper, Eq. 11), so that 16 bits hold exactly one turn and wrap without
-//! further code. The period of the paper's Eq. 12 is 4 of these units, not 2. A polynomial is evaluated on [-1, 1] and
-//! continued by `sin(z) = sin(2 - z)` (Eq. 18), which with words that wrap also holds below -1. All products fit 32
-//! bits.
+//! further code. The period of the paper's Eq. 12 is 4 of these units, not 2. All products fit 32 bits.
 //!
 //! | function | order | mean error | max error |
 //! |---|---|---|---|
-//! | [`sine`], [`cosine`] | 7 | 1.6e-5 | 6.1e-5 |
-//! | `paper_sine`, `paper_cosine` | 5 | 1.9e-4 | 4.4e-4 |
+//! | [`sine`], [`cosine`] | 5 and 4, of the nearest quarter turn | 1.56e-5 | 4.7e-5 |
+//! | `seventh_order_sine_cosine` | 7, of one quarter turn | 1.57e-5 | 6.1e-5 |
+//! | `paper_sine`, `paper_cosine` | 5, of one quarter turn | 1.9e-4 | 4.4e-4 |
 //!
-//! The errors are over all 65 536 angles; rounding to Q1.14 alone costs 1.5e-5 in the mean. All four
-//! functions are exact at 0 and at the quarter turns, exactly odd (or even), and within [-1, 1]. They never
-//! panic, and their work is bounded. Cells use the seventh order; the paper's fifth order is available for
-//! comparison with the feature `oracle`.
+//! The errors are over all 65 536 angles; rounding to Q1.14 alone costs 1.5e-5 in the mean. All functions
+//! are exact at 0 and at the quarter turns, exactly odd (or even), and within [-1, 1]. They never panic, and
+//! their work is bounded. Cells use the first. Cells of earlier builds used the seventh order; their recordings are
+//! replayed with it (feature `host`). The paper's is available for comparison (feature `oracle`).
 
 use core::f64::consts::FRAC_PI_2;
 
 use protocol::fixed::Q1_14;
 
+#[cfg(any(feature = "oracle", feature = "host"))]
+mod odd_polynomial;
 #[cfg(feature = "oracle")]
 pub(crate) mod paper;
+#[cfg(feature = "host")]
+pub(crate) mod seventh_order;
 
 #[cfg(feature = "oracle")]
 pub use paper::{paper_cosine, paper_sine};
 
-/// The number one, with the 16 fraction bits of the polynomials.
-const ONE_Q16: i32 = 1 << 16;
 /// A quarter turn as a word.
 pub(crate) const QUARTER_TURN: Q1_14 = Q1_14::from_bits(1 << 14);
 
-/// Coefficients of z, z^3, z^5 and z^7 in the polynomial of seventh order for the sine of z quarter turns.
+/// Coefficients of z, z^3 and z^5 in the polynomial for the sine of z quarter turns, |z| <= 1/2, with 16 fraction bits.
 ///
-/// The coefficients were found by search. Among all integers whose sum is one (so that the sine of a quarter turn is
-/// one), they have the smallest mean error when every intermediate result is truncated.
-const SEVENTH_ORDER_COEFFICIENTS: [i32; 4] = [ONE_Q16 + 42_330 - 5_214 + 291, -42_330, 5_214, -291];
+/// They and those of the cosine were found by search: they have the smallest mean error with the truncations of
+/// [`sine_cosine`]. `cortex_m0.s` has the same numbers.
+const SINE_COEFFICIENTS: [i32; 3] = [102_943, -42_307, 5_063];
+/// Coefficients of z^2 and z^4 for the cosine, with 15 fraction bits.
+const COSINE_COEFFICIENTS: [i32; 2] = [-40_407, 8_082];
 
 /// Returns the sine of an angle in quarter turns, in [-1, 1].
 ///
-/// Seventh order; the mean error over all angles is below 1.6e-5, and the maximum below 6.2e-5.
+/// The mean error over all angles is below 1.56e-5, and the maximum below 4.8e-5.
 #[must_use]
 pub fn sine(angle: Q1_14) -> Q1_14 {
-    evaluate_odd_polynomial(angle, SEVENTH_ORDER_COEFFICIENTS)
+    let [sine, _] = sine_cosine(angle);
+    word_within_one(sine)
 }
 
 /// Returns the cosine of an angle in quarter turns: the [`sine`] a quarter turn later (Eq. 19).
 #[must_use]
 pub fn cosine(angle: Q1_14) -> Q1_14 {
-    sine(angle.wrapping_add(QUARTER_TURN))
+    let [_, cosine] = sine_cosine(angle);
+    word_within_one(cosine)
 }
 
-/// Returns [`sine`] and [`cosine`] of one angle in steps of 2^-14. The results are identical to those of the two
-/// functions, but take less time.
+/// Converts a sine or cosine in steps of 2^-14 to a word.
+fn word_within_one(steps: i32) -> Q1_14 {
+    let [low, high, ..] = steps.to_le_bytes();
+    Q1_14::from_bits(i16::from_le_bytes([low, high]))
+}
+
+/// Returns [`sine`] and [`cosine`] of one angle in steps of 2^-14.
+///
+/// The angle is split into the nearest quarter turn and the rest, at most an eighth of a turn, for which short
+/// polynomials suffice.
 #[inline]
 pub(crate) fn sine_cosine(angle: Q1_14) -> [i32; 2] {
-    evaluate_sine_cosine(angle, SEVENTH_ORDER_COEFFICIENTS)
+    let bits = i32::from(angle.to_bits());
+    let z = (bits << 18) >> 18;
+    // 17 fraction bits; the one makes up for what truncations take away.
+    let square = (product_fitting_i32(z, z) >> 11) + 1;
+    let [first, third, fifth] = SINE_COEFFICIENTS;
+    let factor = third + (product_fitting_i32(square, fifth) >> 17);
+    let factor = first + (product_fitting_i32(square, factor) >> 17);
+    let sine = round_shifted::<16>(product_fitting_i32(z, factor));
+    let [second, fourth] = COSINE_COEFFICIENTS;
+    let factor = second + (product_fitting_i32(square, fourth) >> 17);
+    let cosine = (1 << 14) + round_shifted::<18>(product_fitting_i32(square, factor));
+    let nearest = round_shifted::<14>(bits);
+    let [sine, cosine] = if nearest & 1 == 0 { [sine, cosine] } else { [cosine, -sine] };
+    if nearest & 2 == 0 { [sine, cosine] } else { [-sine, -cosine] }
 }
 
-/// Returns sine and cosine, computed with an odd polynomial whose coefficients add up to one. The angle is folded to
-/// |z| within one quarter turn. |sin z| is the polynomial of |z|, and |cos z| is the polynomial of 1 - |z|.
-/// Intermediate results can be negative only because coefficients are.
+/// Shifts right and rounds to nearest, ties up.
 #[inline]
-fn evaluate_sine_cosine<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) -> [i32; 2] {
-    let quarter = 1 << 14;
-    let z = i32::from(angle.to_bits());
-    let negative = z >> 31;
-    let left = quarter - ((z ^ negative) - negative); // of the first quarter; below zero in the second
-    let beyond = left >> 31;
-    let left_over = (left ^ beyond) - beyond;
-    let folded = quarter - left_over;
-    let squares =
-        [product_fitting_i32(folded, folded) >> 13, product_fitting_i32(left_over, left_over) >> 13];
-    let horner = |[s, c]: [i32; 2], [coefficient, _]: [i32; 2]| {
-        [
-            coefficient + (product_fitting_i32(squares[0], s) >> 15),
-            coefficient + (product_fitting_i32(squares[1], c) >> 15),
-        ]
-    };
-    let factors = coefficients.map(|it| [it, it]).into_iter().rev().reduce(horner).unwrap_or([0; 2]);
-    // Rounded, ties away from zero, because the sign is applied later.
-    let sine = ((product_fitting_i32(folded, factors[0]) >> 15) + 1) >> 1;
-    let cosine = ((product_fitting_i32(left_over, factors[1]) >> 15) + 1) >> 1;
-    [(sine ^ negative) - negative, (cosine ^ beyond) - beyond]
+const fn round_shifted<const BITS: u32>(number: i32) -> i32 {
+    ((number >> (BITS - 1)) + 1) >> 1
 }
 
 /// Folds an angle to a word within [-1, 1] quarter turns with the same sine.
@@ -89,18 +94,6 @@ fn fold_angle(angle: Q1_14) -> i32 {
     let z = angle.to_bits();
     let folded = if z.unsigned_abs() <= 1 << 14 { z } else { i16::MIN.wrapping_sub(z) };
     i32::from(folded)
-}
-
-/// Evaluates an odd polynomial at the folded angle. Its coefficients must add up to one.
-fn evaluate_odd_polynomial<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) -> Q1_14 {
-    let z = fold_angle(angle);
-    let square = product_fitting_i32(z, z) >> 13; // 15 fraction bits, at most 2^15
-    let horner = |sum: i32, coefficient: i32| coefficient + (product_fitting_i32(square, sum) >> 15);
-    let factor = coefficients.into_iter().rev().reduce(horner).unwrap_or(0);
-    let sine = product_fitting_i32(z, factor); // 30 fraction bits, at most 2^30
-    let rounded = (sine + (1 << 15) + (sine >> 31)) >> 16; // ties away from zero, which is odd
-    let [low, high, ..] = rounded.to_le_bytes(); // a sine is within 1
-    Q1_14::from_bits(i16::from_le_bytes([low, high]))
 }
 
 /// Returns a product that is known to fit 32 bits. A release build does not check this, because on a small processor
@@ -146,7 +139,6 @@ const SINE_TAYLOR_COEFFICIENTS: [i64; 8] = {
 
 #[cfg(test)]
 mod tests {
-    use super::paper::paper_sine_cosine;
     use super::*;
     use protocol::fixed::Accumulator;
 
@@ -163,11 +155,17 @@ mod tests {
         (sum / 65_536.0, max)
     }
 
+    fn earlier(angle: Q1_14) -> Q1_14 {
+        let [sine, _] = seventh_order::seventh_order_sine_cosine(angle);
+        word_within_one(sine)
+    }
+
     #[test]
     fn the_errors_over_all_angles_are_within_what_the_table_says() {
         for (name, (mean, max), bars) in [
-            ("sine", errors(|z| sine(z).to_f64(), f64::sin), (1.6e-5, 6.2e-5)),
-            ("cosine", errors(|z| cosine(z).to_f64(), f64::cos), (1.6e-5, 6.2e-5)),
+            ("sine", errors(|z| sine(z).to_f64(), f64::sin), (1.56e-5, 4.8e-5)),
+            ("cosine", errors(|z| cosine(z).to_f64(), f64::cos), (1.56e-5, 4.8e-5)),
+            ("earlier sine", errors(|z| earlier(z).to_f64(), f64::sin), (1.6e-5, 6.2e-5)),
             ("paper's sine", errors(|z| paper_sine(z).to_f64(), f64::sin), (1.9e-4, 4.4e-4)),
             ("paper's cosine", errors(|z| paper_cosine(z).to_f64(), f64::cos), (1.9e-4, 4.4e-4)),
         ] {
@@ -183,13 +181,12 @@ mod tests {
     }
 
     #[test]
-    fn both_together_are_each_of_them_at_every_angle() {
+    fn a_cosine_is_the_sine_a_quarter_turn_later() {
         for bits in i16::MIN..=i16::MAX {
             let angle = Q1_14::from_bits(bits);
-            let each =
-                |functions: [fn(Q1_14) -> Q1_14; 2]| functions.map(|it| i32::from(it(angle).to_bits()));
-            assert_eq!(sine_cosine(angle), each([sine, cosine]), "at {bits}");
-            assert_eq!(paper_sine_cosine(angle), each([paper_sine, paper_cosine]), "at {bits}");
+            let later = angle.wrapping_add(QUARTER_TURN);
+            assert_eq!(cosine(angle), sine(later), "at {bits}");
+            assert_eq!(paper_cosine(angle), paper_sine(later), "at {bits}");
         }
     }
 

@@ -43,7 +43,7 @@ pub(crate) fn parse_time(text: &str) -> Option<f64> {
 /// Parses a time above 0 s, up to 1e7 s.
 pub(crate) fn parse_duration(text: &str) -> Result<f64, String> {
     let seconds = parse_time(text).filter(|seconds| *seconds > 0.0 && *seconds <= 1e7);
-    seconds.ok_or_else(|| "a time above 0 s, up to 1e7 s (10, 500ms, 90s, 10min, 2h)".to_owned())
+    seconds.ok_or_else(|| "use a time above 0 s, up to 1e7 s, such as 10, 500ms, 90s, 10min or 2h".to_owned())
 }
 
 /// Parses a time from 0 s to 1e9 s, and returns it in ns.
@@ -51,7 +51,7 @@ pub(crate) fn parse_duration(text: &str) -> Result<f64, String> {
 pub(crate) fn parse_time_ns(text: &str) -> Result<u64, String> {
     let seconds = parse_time(text).filter(|seconds| (0.0..=1e9).contains(seconds));
     let nanos = seconds.map(|seconds| (seconds * 1e9).round() as u64);
-    nanos.ok_or_else(|| "a time from 0 s to 1e9 s (10, 500ms, 90s, 10min, 2h)".to_owned())
+    nanos.ok_or_else(|| "use a time from 0 s to 1e9 s, such as 10, 500ms, 90s, 10min or 2h".to_owned())
 }
 
 /// The option for the kinds of one or several buses.
@@ -96,7 +96,7 @@ pub(crate) fn environment_number(name: &str, allowed: RangeInclusive<u32>) -> Re
     let number = given.to_str().and_then(|text| text.parse().ok()).filter(|number| allowed.contains(number));
     number.map(Some).ok_or_else(|| {
         let (given, [min, max]) = (given.display(), [allowed.start(), allowed.end()]);
-        Failure::usage_error(format!("the environment variable {name}={given}: {min} to {max} is allowed"))
+        Failure::usage_error(format!("the environment variable {name} is {given}: use {min} to {max}"))
     })
 }
 
@@ -108,7 +108,7 @@ pub(crate) fn cells_per_process() -> Result<usize, Failure> {
 /// The option for the number of cells per process.
 #[derive(Args, Clone, Copy, Debug)]
 pub(crate) struct ProcessOptions {
-    /// Put up to N cells into one process
+    /// Run up to N cells in one process
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=254))]
     pub(crate) cells_per_process: u8,
 }

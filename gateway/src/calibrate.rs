@@ -42,7 +42,7 @@ use super::robot_file::{SkinRobot, urdf_path};
 /// Moves the robot through poses and swings within its limits and records the cells' accelerations. Estimates for each
 /// cell the joint that moves it, its position and orientation, and the bias and gain of its sensor, each with its
 /// uncertainty. Simulated cells get accelerometers with the errors of a data sheet. With --recording, uses a recording
-/// instead, also of a robot that another program moved. Exit code 0: all cells can be trusted; 1: some cannot, or the
+/// instead, also of a robot that another program moved. Exit code 0: all cells are reliable; 1: some are not, or the
 /// command failed; 2: wrong use or configuration.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
@@ -50,31 +50,31 @@ use super::robot_file::{SkinRobot, urdf_path};
   skinbus calibrate skin.toml --recording run.mcap --page found.html
   skinbus calibrate skin.toml --dry-run > motion.json")]
 pub(crate) struct CalibrateCommand {
-    /// The skin: robot, buses and cells; the poses of its cells may be wrong
+    /// Skin file with robot, buses and cells; the poses of the cells may be wrong
     skin: PathBuf,
-    /// Write a copy of the skin with the poses found
+    /// Write a copy of the skin file with the poses found
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     /// Use a recording or candump log instead of a run; name all parts of a split recording
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["record", "no_spawn", "dry_run"])]
     recording: Vec<PathBuf>,
-    /// Keep the recording of the run
+    /// Save the recording of the run in this file
     #[arg(long, value_name = "FILE.mcap")]
     record: Option<PathBuf>,
-    /// Write the result as an HTML page in 3D, with a line from each old position to the new one
+    /// Write the result as an HTML page with a 3D view, with a line from each old position to the new one
     #[arg(long, value_name = "FILE.html")]
     page: Option<PathBuf>,
     /// Start pose of the robot: a position in rad or m for each joint, separated by spaces. Default: the middle of the
     /// limits
     #[arg(long, value_name = "POSITIONS", allow_hyphen_values = true)]
     start: Option<String>,
-    /// Maximum distance of each joint from the start, in rad or m: choose it so that the robot hits nothing
+    /// Maximum distance of each joint from the start pose, in rad or m; choose it so that the robot hits nothing
     #[arg(long, value_name = "RAD", default_value_t = 1.0)]
     within: f64,
     /// Maximum duration of the motion
     #[arg(long, value_name = "TIME", default_value = "150s", value_parser = parse_duration)]
     duration: f64,
-    /// Distance between wired cells in mm: improves positions
+    /// Distance between wired cells in mm; it improves the positions found
     #[arg(long, value_name = "MM")]
     spacing: Option<f64>,
     /// Also estimate a zero offset for each joint
@@ -87,7 +87,7 @@ pub(crate) struct CalibrateCommand {
     /// Print the motion as JSON and move nothing
     #[arg(long)]
     dry_run: bool,
-    /// Start no cells: they are already on the bus, or are real
+    /// Start no cells; use the real or simulated cells that are already on the buses
     #[arg(long)]
     no_spawn: bool,
     #[command(flatten)]
@@ -142,7 +142,7 @@ impl CalibrateCommand {
         match calibration.summary.troubled {
             0 => Ok(()),
             troubled => Err(Failure::run_error(format!(
-                "{}: {} of {} cannot be trusted: see the lines above",
+                "{}: {} of {} are unreliable: the lines above state why",
                 skin.name,
                 troubled,
                 count_with_noun(skin.cells.len(), "cell")
@@ -154,13 +154,15 @@ impl CalibrateCommand {
         let mut bounds =
             PlanBounds { within: self.within, length_s: self.duration, ..PlanBounds::from_skin(skin) };
         if !(0.05..=6.3).contains(&self.within) {
-            return Err(Failure::usage_error(format!("--within {}: 0.05 to 6.3 is allowed", self.within)));
+            return Err(Failure::usage_error(format!("--within {}: use 0.05 to 6.3", self.within)));
         }
         if let Some(start) = &self.start {
             let number = |word: &str| {
                 let number = word.parse::<f64>().ok().filter(|number| number.is_finite());
                 number.ok_or_else(|| {
-                    Failure::usage_error(format!("--start {word}: it must be a number, in rad or m"))
+                    Failure::usage_error(format!(
+                        "--start {word}: each position must be a number, in rad or m"
+                    ))
                 })
             };
             bounds.center = start.split_whitespace().map(number).collect::<Result<_, _>>()?;
@@ -175,7 +177,7 @@ impl CalibrateCommand {
         };
         let spacing = self.spacing.map(|mm| {
             let fits = (1.0..=1_000.0).contains(&mm);
-            let wrong = || Failure::usage_error(format!("--spacing {mm}: 1 to 1000 mm are allowed"));
+            let wrong = || Failure::usage_error(format!("--spacing {mm}: use 1 to 1000 mm"));
             fits.then(|| Spacing::with_distance(mm * 1e-3)).ok_or_else(wrong)
         });
         let threads = thread::available_parallelism().map_or(1, usize::from);
@@ -193,8 +195,8 @@ impl CalibrateCommand {
     ) -> Result<Calibration, Failure> {
         if matches!(skin.controller.kind, ControllerKind::External { .. }) {
             return Err(Failure::usage_error(
-                "[controller] kind = \"external\": another program moves this robot; record it with `skinbus run --record` and \
-                 give it with --recording",
+                "[controller] kind = \"external\": another program moves this robot; record a run with \
+                 `skinbus run --record`, and give the recording with --recording",
             ));
         }
         let folder = tempfile::tempdir().map_err(Failure::run_error)?;
@@ -203,19 +205,21 @@ impl CalibrateCommand {
         let seconds = options.scenario.duration.0 / 1_000_000;
         let within = self.within;
         options.announced.push(format!(
-            "the robot moves for {seconds} s around its start pose, each joint by {within} at most"
+            "the robot will move for {seconds} s around its start pose, each joint by at most {within} rad or m"
         ));
         let summary =
             run::run(&options, None).map_err(|error| Failure::with_code(error.exit_code(), error))?;
         let mut complaints = summary.end_messages(self.quiet);
         if summary.outcome != Outcome::Done {
-            let last = complaints.pop().unwrap_or_else(|| "the run did not come to its end".to_owned());
+            let last = complaints.pop().unwrap_or_else(|| "the run did not finish".to_owned());
             return Err(Failure::run_error(last));
         }
         complaints.iter().for_each(|line| print_note(format_args!("skinbus: {line}")));
         if summary.control.ticks_skipped > 0 {
             let (ticks, broadcasts) = (summary.control.ticks_skipped, summary.control.broadcasts_skipped);
-            print_note(format_args!("the loop skipped {ticks} ticks, and {broadcasts} broadcasts with them"));
+            print_note(format_args!(
+                "the control loop skipped {ticks} ticks, and with them {broadcasts} joint broadcasts"
+            ));
         }
         calibrate_capture(&[path], skin, settings)
     }
@@ -316,7 +320,7 @@ fn calibrate_capture(files: &[PathBuf], skin: &Skin, settings: &Settings) -> Res
 fn report_text(skin: &Skin, calibration: &Calibration) -> String {
     let summary = &calibration.summary;
     let mut lines = vec![format!(
-        "{}: {}, {} poses found, {} cells not to be trusted",
+        "{}: {}, {} poses found, {} cells unreliable",
         skin.name,
         count_with_noun(summary.cells, "cell"),
         summary.determined,
@@ -326,7 +330,8 @@ fn report_text(skin: &Skin, calibration: &Calibration) -> String {
         (summary.position_mm, summary.orientation_deg, summary.noise_mg)
     {
         lines.push(format!(
-            "uncertainty {mm:.2} mm and {degrees:.2} degrees (median of the 95 % limits); readings scatter by {mg:.1} mg"
+            "pose uncertainty {mm:.2} mm and {degrees:.2} degrees (median of the 95 % limits); readings \
+             scatter by {mg:.1} mg"
         ));
     }
     lines.push(summary.joints.to_string());
@@ -341,11 +346,12 @@ fn report_text(skin: &Skin, calibration: &Calibration) -> String {
         ));
     }
     if summary.wires > 0 {
-        lines.push(format!("{} made positions better", count_with_noun(summary.wires, "wire")));
+        lines.push(format!("{} improved the positions", count_with_noun(summary.wires, "wire")));
     }
     lines.extend(calibration.zero_offsets.iter().flatten().map(ToString::to_string));
     for cell in &calibration.cells {
-        lines.extend(cell.troubles.iter().map(|trouble| format!("{} {}: {trouble}", cell.bus, cell.node)));
+        let name = format!("{}:{}", cell.bus, cell.node);
+        lines.extend(cell.troubles.iter().map(|trouble| format!("cell {name}: {trouble}")));
     }
     lines.join("\n") + "\n"
 }

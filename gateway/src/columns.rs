@@ -97,7 +97,7 @@ impl CsvRow<'_> {
     /// Returns the number in a column.
     pub(crate) fn number(&self, column: &str) -> Result<f64, Failure> {
         let number = self.text(column).parse().ok().filter(|number: &f64| number.is_finite());
-        number.ok_or_else(|| self.value_error(column, "a finite number is needed"))
+        number.ok_or_else(|| self.value_error(column, "use a finite number"))
     }
 
     /// Returns the error for a wrong value in a column; `needed` names the allowed values.
@@ -170,6 +170,6 @@ mod tests {
         assert_eq!(short, "t.csv: line 2 has 1 value: write one value for each of the columns a, b");
         let row = table.next_row().unwrap().unwrap();
         let infinite = row.number("b").unwrap_err().to_string();
-        assert_eq!(infinite, "t.csv: line 4: b = \"inf\": a finite number is needed");
+        assert_eq!(infinite, "t.csv: line 4: b = \"inf\": use a finite number");
     }
 }

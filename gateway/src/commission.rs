@@ -25,8 +25,8 @@ use super::{input, output};
 /// Finds each cell by its serial number, writes the robot's table, the pose, gains and thresholds into its flash, reads
 /// everything back and compares. A cell applies its new parameters all at once, so the command may be interrupted at
 /// any moment and run again: cells with the right configuration are skipped. Cells that the skin does not have are
-/// listed and left alone. Exit code 0: all cells have the skin's configuration; 1: some do not, and the table gives the
-/// reason; 2: wrong use or configuration.
+/// listed and not changed. Exit code 0: all cells have the skin's configuration; 1: some do not, and the table gives
+/// the reason; 2: wrong use or configuration.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus commission skin.toml
@@ -136,7 +136,7 @@ fn check_reached(file: &str, done: &[CommissionedBus], interrupted: bool) -> Res
         return Err(Failure::run_error(done.failure.clone().unwrap_or_default()));
     }
     if interrupted {
-        return Err(Failure::run_error("interrupted; nothing was written yet"));
+        return Err(Failure::run_error("interrupted before anything was written"));
     }
     let found = done.iter().flat_map(|done| &done.report.cells).any(|it| it.number.is_some());
     if found {

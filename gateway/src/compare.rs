@@ -183,7 +183,7 @@ impl CompareCommand {
             inputs.get_mut(which).read_entry(which, &mut comparison);
         }
         if stop::stop_flag().load(Ordering::Relaxed) {
-            return Err(Failure::run_error("stopped before all was compared"));
+            return Err(Failure::run_error("interrupted before the comparison was complete"));
         }
         for which in [CaptureSide::A, CaptureSide::B] {
             self.check_capture(inputs.get_mut(which), which, &mut comparison, &skin)?;
@@ -288,7 +288,8 @@ impl CompareCommand {
         }
         comparison.reported_and_matching_cells(which).map_or(Ok(()), |(all, same)| {
             Err(Failure::usage_error(format!(
-                "{name} does not match the skin {}: of {}, only {same} have its parameters; name the right skin with --skin",
+                "{name} does not match the skin {}: of {}, only {same} have the parameters of this skin; name the \
+                 right skin with --skin",
                 skin.name,
                 count_with_noun(all, "cell")
             )))

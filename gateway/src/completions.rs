@@ -34,7 +34,7 @@ impl CompletionsCommand {
   skinbus man ~/.local/share/man/man1
   skinbus man - | man -l -")]
 pub(crate) struct ManCommand {
-    /// An existing directory; - for skinbus.1 on standard output
+    /// Existing directory for the pages; - writes skinbus.1 to standard output
     #[arg(value_name = "DIR")]
     folder: PathBuf,
     #[command(flatten)]
@@ -59,7 +59,7 @@ impl ManCommand {
         for (name, text) in &pages {
             self.overwrite.write("", &self.folder.join(name), text)?;
         }
-        print_note(format_args!("{} man pages in {}", pages.len(), self.folder.display()));
+        print_note(format_args!("{} man pages written to {}", pages.len(), self.folder.display()));
         Ok(())
     }
 }

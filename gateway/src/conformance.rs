@@ -25,12 +25,12 @@ use super::{input, output};
 /// Maximum duration of a test, without the time to listen at the start and to restore the cell at the end.
 const MAX_TEST_DURATION: Span = Span::from_millis(80_000);
 
-/// Test one cell of any make against the requirements of the documents
+/// Test one cell of any make against the documented requirements
 ///
-/// Takes the cell through all numbered requirements of cell.md and sensing.md in at most 90 s, and prints the result of
-/// each; for failures also the frames that show it. The test brings its own configurations: it first saves the cell's
-/// configuration to a file, and restores it at the end, even if interrupted. The cell and the test must be alone on the
-/// bus. Exit code 0: no requirement failed; 1: one failed, or the test could not run; 2: wrong use.
+/// Checks all numbered requirements of cell.md and sensing.md in at most 90 s and prints a verdict on each, with the
+/// frames that show a failure. The test commits configurations of its own: it first saves the cell's configuration to a
+/// file, and restores it at the end, even after Ctrl-C or SIGTERM. No other cell or gateway may use the bus during the
+/// test. Exit code 0: no requirement failed; 1: a requirement failed, or the test could not run; 2: wrong use.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus conformance --bus can0 --cell 12
@@ -38,10 +38,10 @@ const MAX_TEST_DURATION: Span = Span::from_millis(80_000);
   skinbus conformance --bus can0 --cell 12 --requirement CONF,COUNT-1
   skinbus conformance --bus can0 --cell 12 --restore conformance-can0-12.json")]
 pub(crate) struct ConformanceCommand {
-    /// The bus, if --cell does not name it
+    /// Bus of the cell, if --cell does not name it
     #[arg(long, value_name = "NAME")]
     bus: Option<String>,
-    /// The cell
+    /// Cell to test
     #[arg(long, value_name = "[BUS:]NODE")]
     cell: CellName,
     #[command(flatten)]
@@ -52,22 +52,22 @@ pub(crate) struct ConformanceCommand {
     /// Test only these requirements: CONF-7, or CONF for all whose ids begin with CONF
     #[arg(long, value_name = "ID", value_delimiter = ',')]
     requirement: Vec<String>,
-    /// Shell command that switches the cell off and on, for requirements that can be tested only at a start
+    /// Shell command that switches the cell off and on; needed for the requirements on the start of a cell
     #[arg(long, value_name = "COMMAND")]
     restart: Option<String>,
-    /// Test even if other cells are on the bus: they receive the joints and halts of the test too
+    /// Test even if other cells are on the bus; they also receive the joints and halts of the test
     #[arg(long)]
     others_will_stop: bool,
-    /// File for the cell's saved configuration [default: conformance-BUS-NODE.json]
+    /// Save the cell's configuration to this file [default: conformance-BUS-NODE.json]
     #[arg(long, value_name = "FILE")]
     save: Option<PathBuf>,
-    /// Test nothing: restore a configuration that an earlier test saved, and delete the file
+    /// Restore the configuration that an earlier test saved in this file, delete the file, and test nothing
     #[arg(long, value_name = "FILE", conflicts_with_all = ["requirement", "restart", "json", "junit", "save"])]
     restore: Option<PathBuf>,
     /// Print one JSON object instead of the table
     #[arg(long, short)]
     json: bool,
-    /// Also write a JUnit report
+    /// Also write the verdicts to this file as a JUnit report
     #[arg(long, value_name = "FILE")]
     junit: Option<PathBuf>,
     #[command(flatten)]
@@ -78,12 +78,17 @@ impl ConformanceCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let only = RequirementFilter::new(&self.requirement).map_err(|word| {
             Failure::usage_error(format!(
-                "--requirement {word}: no requirement has this id; CONF-7 and CONF are examples"
+                "--requirement {word}: no requirement has this id; give an id such as CONF-7, or a group \
+                 such as CONF"
             ))
         })?;
         let stopped = input::stop_flag()?;
         let name = match (&self.bus, &self.cell.bus) {
-            (None, None) => return Err(Failure::usage_error("--bus is missing: name the bus of the cell")),
+            (None, None) => {
+                return Err(Failure::usage_error(
+                    "the bus of the cell is missing: add --bus NAME, or write --cell BUS:NODE",
+                ));
+            }
             (Some(bus), Some(other)) if bus != other => {
                 return Err(Failure::usage_error(format!(
                     "--cell {} is not on {bus}: correct --cell, or leave out --bus",
@@ -98,8 +103,8 @@ impl ConformanceCommand {
         if self.restore.is_none() && path.exists() {
             let path = path.display();
             return Err(Failure::usage_error(format!(
-                "{path} was left by an earlier test that did not restore the cell: restore it with --restore {path}, \
-                 or delete the file"
+                "an earlier test left {path} and did not restore the cell: restore the cell with --restore \
+                 {path}, or delete the file"
             )));
         }
         let junit = self.junit.as_ref().map(|path| self.overwrite.create("--junit", path)).transpose()?;
@@ -163,7 +168,8 @@ fn restore_cell(session: &mut Session<'_>, saved: &SavedCell, path: &PathBuf) ->
     let keep = |why: &dyn std::fmt::Display| {
         let path = path.display();
         Failure::run_error(format!(
-            "the cell was not restored: {why}; {path} holds its configuration: restore it with --restore {path}"
+            "the cell was not restored: {why}; its configuration is in {path}: restore it with --restore \
+             {path}"
         ))
     };
     let left = session.restore(saved).map_err(|stop| keep(&stop))?;

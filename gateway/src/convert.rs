@@ -66,7 +66,7 @@ pub(crate) struct ConvertCommand {
     /// Fail at the first malformed frame line, or if IN is truncated; then write nothing
     #[arg(long)]
     strict: bool,
-    /// Digits of a second in a log [default: as many as IN has]
+    /// Number of decimals of a second in a log [default: as many as IN has]
     #[arg(long, value_parser = one_of_values(DIGITS), value_name = "N")]
     digits: Option<TimeDigits>,
     /// Write the direction, T or R, after each frame of a log, which Wireshark cannot read. Without this option, only
@@ -274,7 +274,7 @@ impl ConvertCommand {
         missing.print_counts(&reader, "left out");
         if let Some(buses) = torques::buses_with_sums(&skin) {
             print_note(format_args!(
-                "{name}: {buses} answers with sums: distributed torques and errors are empty"
+                "{name}: the cells on {buses} answer with sums: distributed torques and errors are empty"
             ));
         }
         print_note(format_args!("{name} -> {to}: {epochs} epochs"));
@@ -428,7 +428,7 @@ fn remarks(reader: &Reader, done: &ConversionCounts, style: &LogStyle, text: boo
         ),
         (
             done.unreadable_messages,
-            ["message is not of its type", "messages are not of their type"],
+            ["message does not match its type", "messages do not match their types"],
             ": not read",
         ),
         (done.can_xl, ["is a CAN XL frame", "are CAN XL frames"], ": not read"),
@@ -439,7 +439,7 @@ fn remarks(reader: &Reader, done: &ConversionCounts, style: &LogStyle, text: boo
         (
             name,
             ["frame has a bus", "frames have a bus"],
-            " that is written under another name: blanks and controls are _ in a log",
+            " whose name was changed: blanks and control characters are _ in a log",
         ),
         (done.omitted, ["note is left out", "notes are left out"], ""),
     ] {

@@ -112,7 +112,7 @@ pub(crate) struct DumpCommand {
 type PacketFormat = Option<Format>;
 
 const ANY_FORMAT: &[OptionValue<PacketFormat>] = &[
-    ("auto", "Both", None),
+    ("auto", "Accept both formats", None),
     ("fd", "One CAN FD frame", Some(Format::Fd)),
     ("classic", "Two to four classic frames", Some(Format::Classic)),
 ];
@@ -149,7 +149,7 @@ impl DumpCommand {
             if let Some(file) = self.sources.iter().find(|source| self.wait && is_path(source)) {
                 let file = file.display();
                 return Err(Failure::usage_error(format!(
-                    "--wait is only for buses, and there is no file {file}"
+                    "--wait is only for buses, and the file {file} does not exist"
                 )));
             }
         } else if self.wait {
@@ -177,7 +177,7 @@ impl DumpCommand {
             reader.extras().run_began().into_iter().for_each(|zero| show.set_zero_time(zero));
             let done = show_capture(&mut reader, &mut show);
             if let (Ok(()), Some(absent)) = (&done, show.absent_buses()) {
-                output::print_note(format_args!("{title}: no frame comes from {absent}"));
+                output::print_note(format_args!("{title} contains no frame of {absent}"));
             }
             (input::format_name(&reader), Some(reader.extras().clone()), done)
         } else {

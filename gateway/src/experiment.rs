@@ -108,7 +108,7 @@ impl ExperimentCommand {
         // Keep the measured data even if it cannot be drawn.
         write_report(&page, folder).map_err(|failure| {
             failure.append(format_args!(
-                "{} has the results, the data of the figures and the recordings",
+                "{} contains the results, the data of the figures and the recordings",
                 output.display()
             ))
         })?;
@@ -146,7 +146,7 @@ impl ExperimentCommand {
         let command = words.collect::<Vec<_>>().join(" ");
         let about = facts::program_metadata(std::slice::from_ref(&command), 0);
         let fact = |key: &str| about.get(key).cloned().unwrap_or_default();
-        let quick = "quick: few cells, few measurements; no figures of these are results";
+        let quick = "quick: few cells and few measurements; these numbers are not valid results";
         let facts = [
             ("command", Some(command)),
             ("program", Some(format!("{}, revision {}", fact("program"), fact("git_revision")))),
@@ -157,8 +157,8 @@ impl ExperimentCommand {
         let facts = facts.into_iter().filter_map(|(name, fact)| Some((name.to_owned(), fact?))).collect();
         Page {
             title: "The paper's experiments".to_owned(),
-            intro: "Efficient Distributed Torque Computation for Large Scale Robot Skin, done again on a simulated skin: \
-                    each figure measured again, each number beside the paper's."
+            intro: "Efficient Distributed Torque Computation for Large Scale Robot Skin, repeated on a simulated \
+                    skin: each figure is measured again, and each number is shown beside the paper's."
                 .to_owned(),
             facts,
             sections,
@@ -248,7 +248,7 @@ fn write_report(page: &Page, folder: ResultFolder) -> Result<(), Failure> {
 
 /// Prints the findings and the path of the page.
 fn print_findings(page: &Page, report: &Path) -> Result<(), Failure> {
-    let mut rows = KeyValueTable::new("", "here", "paper, bar");
+    let mut rows = KeyValueTable::new("", "here", "paper, limit");
     for section in &page.sections {
         rows.add_section(&section.title, "", "");
         for Finding { what, paper, ours, bar, verdict, .. } in &section.findings {

@@ -21,7 +21,7 @@ use super::print::comma_separated;
 ///
 /// For a skin, computes the worst case: load, time from joints to the last answer, cells and buses, with the longest
 /// frames that bit stuffing allows, all cells answering, and no errors. Heartbeats count; commands and bench-only
-/// frames do not. Default bit rates: those of the skin if it has them for all buses, else a table over common ones.
+/// frames do not. Default bit rates: those of the skin if it has them for all buses, else a table of common ones.
 ///
 /// For a capture (a candump log or an MCAP recording, of any CAN bus), or for live buses until Ctrl-C, computes when
 /// each frame would be sent on a bus with bit rates: exact stuff bits, arbitration by identifier, no frame interrupted.
@@ -47,7 +47,7 @@ pub(crate) struct FitCommand {
     /// Data bit rate of CAN FD frames that switch rates
     #[arg(long, value_name = "RATE", value_parser = parse_bit_rate)]
     data: Option<u32>,
-    /// For a skin: a table for common bit rates, regardless of the skin's rates
+    /// For a skin: print a table for common bit rates, regardless of the skin's rates
     #[arg(long, conflicts_with = "nominal")]
     table: bool,
     /// For a skin: frame format of packets on all buses, instead of the skin's formats
@@ -103,7 +103,7 @@ impl FitCommand {
             )));
         }
         if self.data.is_some() && self.nominal.is_none() {
-            return Err(Failure::usage_error("--data for a skin also needs --nominal"));
+            return Err(Failure::usage_error("--data needs --nominal if a skin is given: add --nominal"));
         }
         let skin = read_skin(skin)?;
         self.print_skin_fit(&skin)
@@ -145,7 +145,7 @@ fn is_capture(file: &Path) -> bool {
 fn rates_of_bus(text: &str) -> Result<(String, BitRates), String> {
     let (bus, rates) = text.split_once('=').unwrap_or_default();
     if bus.is_empty() {
-        return Err("a bus and its bit rates are needed, as can0=1M/5M or can0=500k".to_owned());
+        return Err("use a bus and its bit rates, such as can0=1M/5M or can0=500k".to_owned());
     }
     let rates = rates.parse().map_err(|error| format!("{bus}: {error}"))?;
     Ok((bus.to_owned(), rates))

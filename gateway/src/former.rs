@@ -20,6 +20,9 @@ pub(crate) fn former_command_hint(words: &[String], name: &str) -> Option<String
     Some(format!("there is no command {old}; use {now}"))
 }
 
+/// Text for former options whose value can no longer be chosen.
+const FIXED_VALUE_HINT: &str = "no option instead: the value is fixed now";
+
 /// Returns the line that gives the present name of a former option. `words` are the words of the command line.
 pub(crate) fn former_option_hint(words: &[String], option: &str) -> Option<String> {
     let name = option.split([' ', '=']).next().unwrap_or_default();
@@ -41,20 +44,20 @@ pub(crate) fn former_option_hint(words: &[String], option: &str) -> Option<Strin
         ("cells", "--for") => "--duration",
         ("replay", "--max") => "--speed max",
         ("replay", "--json") => "--summary -",
-        ("skin", "--robot") if words.get(1).is_some_and(|word| word == "generate") => "nothing: it is a UR5",
-        ("replay", "--view" | "--address-file" | "--token-file") => "skinbus view SKIN beside it",
+        ("skin", "--robot") if words.get(1).is_some_and(|word| word == "generate") => {
+            "no option instead: the robot is always a UR5"
+        }
+        ("replay", "--view" | "--address-file" | "--token-file") => "`skinbus view SKIN` in another shell",
         ("replay", "--kind" | "--node") => {
             "--only, or skinbus dump to choose frames and canplayer to send them"
         }
-        ("replay", "--spin" | "--send-timeout" | "--strict") => "nothing: it has a fixed value now",
+        ("replay", "--spin" | "--send-timeout" | "--strict") => FIXED_VALUE_HINT,
         ("demo", "--record-split" | "--address-file" | "--token-file") => "skinbus run",
         ("run", "--receive-buffer") => "the environment variable SKINBUS_RECEIVE_BUFFER",
         ("calibrate", "--from") => "--recording",
         ("demo" | "replay", "--cells-per-process") => "the environment variable SKINBUS_CELLS_PER_PROCESS",
         ("calibrate", "--package") => "a skin whose URDF is beside its packages",
-        ("calibrate", "--seed") | ("calibrate" | "experiment", "--cells-per-process") => {
-            "nothing: it has a fixed value now"
-        }
+        ("calibrate", "--seed") | ("calibrate" | "experiment", "--cells-per-process") => FIXED_VALUE_HINT,
         ("skin", "--cells") if words.get(1).is_some_and(|word| word == "import") => "--places",
         _ => return None,
     };

@@ -191,15 +191,19 @@ fn report_answers(
         }
     }
     print_text(&lines)?;
-    let who = only.map_or_else(|| "cell".to_owned(), |cell| format!("cell {cell}"));
+    let who = only.map_or_else(|| "a cell".to_owned(), |cell| format!("cell {cell}"));
     let (waited, other) = (ANSWER_TIMEOUT.as_secs_f64(), format.other_format().name());
     if !refused.is_empty() {
         return Err(Failure::run_error(comma_separated(&refused)));
     }
     if answers.present_cells().is_empty() {
+        let silent = match only {
+            None => "no cell sent anything".to_owned(),
+            Some(_) => format!("{who} sent nothing"),
+        };
         return Err(Failure::run_error(format!(
-            "no {who} sent anything on {bus} for {waited} s: `skinbus cells {bus}` lists the cells; the format of the bus \
-             may be --format {other}"
+            "{silent} on {bus} for {waited} s: `skinbus cells {bus}` lists the cells; if the bus has another frame \
+             format, use --format {other}"
         )));
     }
     if tag.is_some() && lines.is_empty() {

@@ -7,9 +7,9 @@ use clap::Command;
 /// The groups of commands, each with its commands in the order of the help.
 const GROUPS: [(&str, &[&str]); 7] = [
     ("Run", &["demo", "run", "view"]),
-    ("Look", &["dump", "explain", "report", "cells", "compare"]),
+    ("Inspect", &["dump", "explain", "report", "cells", "compare"]),
     ("Files", &["convert", "replay", "recover"]),
-    ("Size", &["fit"]),
+    ("Bus load", &["fit"]),
     ("Real cells", &["commission", "calibrate", "conformance", "frame"]),
     ("Describe", &["skin", "check", "experiment"]),
     ("Shell", &["completions", "man"]),
@@ -17,7 +17,7 @@ const GROUPS: [(&str, &[&str]); 7] = [
 
 /// Text at the end of the help.
 const HELP_END: &str =
-    "Embedded buses lie in $SKINBUS_DIR, else $XDG_RUNTIME_DIR/skinbus, else /tmp/skinbus-UID.
+    "The sockets of embedded buses are in $SKINBUS_DIR, else $XDG_RUNTIME_DIR/skinbus, else /tmp/skinbus-UID.
 `skinbus COMMAND -h` lists the options of a command, `--help` explains them.
 
 Examples:

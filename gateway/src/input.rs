@@ -58,11 +58,9 @@ pub(crate) fn no_such_source_failure(name: &str, error: &BusError) -> Failure {
             | BusError::NoSocketCan(_)
     );
     if is_path(Path::new(name)) && is_absent {
-        return Failure::usage_error(format!(
-            "there is no file {name}, and no bus of this name: correct the path"
-        ));
+        return Failure::usage_error(format!("there is no file and no bus named {name}: correct the path"));
     }
-    Failure::usage_error(format!("there is no file {name}, and it does not open as a bus: {error}"))
+    Failure::usage_error(format!("there is no file {name}, and opening it as a bus failed: {error}"))
 }
 
 /// Returns the named skin, or else that of a recording. Prints a note if the named skin differs from the recording's.
@@ -83,7 +81,7 @@ pub(crate) fn note_skin_difference(files: &[PathBuf], path: &Path, skin: &Skin) 
     if let Some((what, is, was)) = first_skin_difference(skin, &own) {
         let (path, name) = (path.display(), reader.name());
         output::print_note(format_args!(
-            "--skin {path} is not the skin that {name} was recorded with ({what}: {is}, recorded: {was})"
+            "--skin {path} differs from the skin recorded in {name} ({what}: {is}, recorded: {was})"
         ));
     }
 }
@@ -122,7 +120,7 @@ pub(crate) fn read_skin_or_recording(file: &Path) -> Result<Skin, Failure> {
     if !is_recording {
         return read_skin(file);
     }
-    attached_skin(&[file.to_owned()], "name the skin's own file", || Ok(()))
+    attached_skin(&[file.to_owned()], "name a skin file", || Ok(()))
 }
 
 /// Reads a skin file. If the file is a capture, the error says so, as far as that can be recognised.
@@ -143,7 +141,7 @@ fn capture_error(file: &Path) -> Option<Failure> {
     let name = file.display();
     Some(match reader.has_frame().ok()? {
         true => Failure::usage_error(format!(
-            "{name} is a capture ({}), but a skin is needed: name the skin's own file",
+            "{name} is a capture ({}), but this command needs a skin: name a skin file",
             format_name(&reader)
         )),
         false if reader.text_kind().is_some_and(|(kind, _)| kind == SKIN_OR_SCENARIO) => return None,
@@ -229,15 +227,15 @@ pub(crate) fn no_frame_failure(reader: &Reader) -> Failure {
         ));
     }
     let what = match (reader.format(), reader.line_count()) {
-        (CaptureFormat::Candump, 0) => "it is empty: there is no frame in it".to_owned(),
+        (CaptureFormat::Candump, 0) => "the file is empty".to_owned(),
         (CaptureFormat::Candump, lines) => format!(
-            "there is no frame in {}; expected the output of candump, with lines like \
+            "no frame in {}; expected the output of candump, with lines like \
              `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`",
             count_with_noun(lines, "line")
         ),
         (CaptureFormat::Mcap, _) => match describe_other_contents(reader) {
-            others if others.is_empty() => "there is no frame in it".to_owned(),
-            others => format!("there is no frame in it, only {others}"),
+            others if others.is_empty() => "it contains no frame".to_owned(),
+            others => format!("it contains no frame, only {others}"),
         },
     };
     Failure::run_error(format!("{name}: {what}"))
@@ -349,7 +347,7 @@ impl BusReceiver {
         options: BusOptions,
     ) -> Result<Self, BusError> {
         let bus = listen::open_bus(name, kind, format, BusOptions { error_mask: EXTENDED_MASK, ..options })?;
-        output::print_note(format_args!("{} is {}", bus.name(), bus.kind()));
+        output::print_note(format_args!("{}: bus of kind {}", bus.name(), bus.kind()));
         Ok(Self { bus, follower: Follower::default() })
     }
 
@@ -362,7 +360,7 @@ impl BusReceiver {
             FollowStep::Frames(_) | FollowStep::Leftover(_) => Ok(true),
             FollowStep::Nothing | FollowStep::Drained | FollowStep::Refused(_) => Ok(false),
             FollowStep::Down(error) => {
-                output::print_note(format_args!("skinbus: {error}; waiting"));
+                output::print_note(format_args!("skinbus: {error}; waiting for the bus to return"));
                 Ok(false)
             }
             FollowStep::Gone(error) => Err(error),
@@ -384,7 +382,7 @@ impl BusReceiver {
         let (name, missing) = (self.bus().name(), self.follower.dropped_frames());
         if missing > 0 {
             output::print_note(format_args!(
-                "{name}: {missing} frames are missing: they came faster than they were {done}"
+                "{name}: {missing} frames are missing: they arrived faster than they were {done}"
             ));
         }
         missing

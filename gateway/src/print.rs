@@ -302,8 +302,8 @@ mod tests {
     #[test]
     fn a_long_text_hangs_under_its_begin() {
         assert_eq!(
-            hanging_indent("look at: ", "a few words of it", 20),
-            "look at: a few words\n           of it"
+            hanging_indent("problems: ", "a few words of it", 20),
+            "problems: a few\n            words of\n            it"
         );
         assert_eq!(hanging_indent("", "a few words", 80), "a few words");
     }

@@ -20,7 +20,7 @@ use super::output::{OverwriteOption, check_distinct_files, print_beside_files};
 #[derive(Args, Debug)]
 #[command(after_help = "Example:\n  skinbus recover run.mcap.part -o run.mcap")]
 pub(crate) struct RecoverCommand {
-    /// The recording: an MCAP file of any program
+    /// Recording to repair: an MCAP file, also of another program
     file: PathBuf,
     /// The new file [default: FILE-recovered.mcap]
     #[arg(short, long, value_name = "FILE")]
@@ -35,7 +35,9 @@ impl RecoverCommand {
         let file =
             input::open(&self.file).map_err(|error| Failure::usage_error(format!("{name}: {error}")))?;
         if names::is_locked(&file) {
-            return Err(Failure::usage_error(format!("{name} is being recorded: wait for the run's end")));
+            return Err(Failure::usage_error(format!(
+                "{name} is still being recorded: wait until the run ends"
+            )));
         }
         if self.output.is_none() && self.file.as_os_str() == "-" {
             return Err(Failure::usage_error(

@@ -34,8 +34,8 @@ const SEND_TIMEOUT_MS: u32 = 100;
 ///
 /// Sends frames at the capture's own times, or as fast as the bus accepts them. With --only inputs, the cells on the
 /// bus answer; with --expect, their answers must equal the recorded ones, bit for bit or within a tolerance.
-/// docs/how-to/replay.md explains the comparison. Exit code 0: everything was sent, and all answers were right; 1: not
-/// so; 2: wrong use.
+/// docs/how-to/replay.md explains the comparison. Exit code 0: everything was sent, and all answers were right; 1:
+/// otherwise; 2: wrong use.
 #[derive(Args, Debug)]
 #[command(mut_args(|arg| match arg.get_id().as_str() {
     "cells_per_process" => arg.requires("spawn"),
@@ -126,7 +126,7 @@ const SENDER_FILTERS: &[OptionValue<SenderFilter>] = &[
 fn parse_route(text: &str) -> Result<(String, String), String> {
     match text.split_once('=') {
         Some((from, to)) if !from.is_empty() && !to.is_empty() => Ok((from.to_owned(), to.to_owned())),
-        _ => Err("a bus of the capture and the bus it goes to, such as vcan0=vcan1".to_owned()),
+        _ => Err("use a bus of the capture and the bus to send it on, such as vcan0=vcan1".to_owned()),
     }
 }
 
@@ -134,7 +134,7 @@ fn speed(text: &str) -> Result<ReplaySpeed, String> {
     match text.parse::<f64>() {
         _ if text == "max" => Ok(ReplaySpeed::Max),
         Ok(speed) if (0.1..=100.0).contains(&speed) => Ok(ReplaySpeed::Timed(speed)),
-        _ => Err("a number from 0.1 to 100, or max".to_owned()),
+        _ => Err("use a number from 0.1 to 100, or max".to_owned()),
     }
 }
 
@@ -251,7 +251,7 @@ fn table(summary: &Summary, is_coloured: bool) -> String {
 
 fn comparison_rows(rows: &mut KeyValueTable, expect: &ReplyComparison) {
     let tally = &expect.tally;
-    rows.add_section("replies", "against the recording", "");
+    rows.add_section("replies", "compared with the recording", "");
     let within = format!("{} of them within the tolerance of {} steps", tally.tolerated, expect.tolerance);
     rows.add_row("equal", tally.equal, if tally.tolerated > 0 { &within } else { "bit for bit" });
     rows.add_row("different", tally.different, "");
@@ -265,17 +265,17 @@ fn comparison_rows(rows: &mut KeyValueTable, expect: &ReplyComparison) {
     rows.add_row("extra", tally.extra, "");
     rows.add_row_unless_zero("not requested", tally.not_requested, "a bus refused the joints");
     for (reason, count) in tally.lacking.reason_counts() {
-        rows.add_row("not in the recording", count, reason);
+        rows.add_row("not recorded", count, reason);
     }
     rows.add_row_unless_zero(
         "lost by the recorder",
         expect.recording_dropped,
-        "inputs among them are missing here",
+        "the replay lacks the inputs among them",
     );
     rows.add_row_unless_zero(
         "unknown configurations",
         expect.unchecked_cells,
-        "not recorded before they were changed",
+        "they were changed before they were recorded",
     );
 }
 
@@ -286,9 +286,10 @@ fn difference_rows(rows: &mut KeyValueTable, what: &str, steps: &StepHistogram, 
     let found: Vec<_> = counts.filter(|(_, count)| **count > 0).collect();
     let Some((worst, _)) = found.last().filter(|(worst, _)| *worst > usual) else { return };
     let last = steps.by_steps.len() - 1;
-    let of = format!("of {}, at most {} steps off", steps.by_steps.iter().sum::<u64>(), steps.max);
+    let of = format!("of {}, by at most {} steps", steps.by_steps.iter().sum::<u64>(), steps.max);
     for (by, count) in &found {
         let more = if *by == last { " or more" } else { "" };
-        rows.add_row(format!("{what} words off by {by}{more}"), count, if by == worst { &of } else { "" });
+        let beside = if by == worst { &of } else { "" };
+        rows.add_row(format!("{what} words that differ by {by}{more}"), count, beside);
     }
 }

@@ -31,7 +31,7 @@ pub(crate) struct ReportCommand {
     /// Or frames only: a candump log, or another program's MCAP file
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
-    /// The skin, for a candump log; a recording contains its own
+    /// The skin of a candump log; a recording contains its own
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
     /// The HTML page to write; - for standard output [default: the recording's name with .html]
@@ -128,7 +128,8 @@ fn report_failure(error: ReportError, skin: Option<&(String, Skin)>) -> Failure 
             let first =
                 first.map_or_else(String::new, |(what, is, was)| format!(" ({what}: {is}, recorded: {was})"));
             Failure::usage_error(format!(
-                "{name} was recorded with another skin than {file}{first}; leave --skin out: the recording contains its skin"
+                "{name} was recorded with a skin that differs from {file}{first}; leave --skin out: the recording \
+                 contains its skin"
             ))
         }
         (error, _) => Failure::usage_error(error),

@@ -29,16 +29,16 @@ impl SkinRobot {
     pub(crate) fn read(skin: &Skin, file: Option<&Path>) -> Result<Self, Failure> {
         let of_rows = || {
             RecordedRobot::from_rows(skin)
-                .map_err(|error| print_note(format_args!("the robot is not shown: {error}")))
+                .map_err(|error| print_note(format_args!("the robot is not drawn: {error}")))
                 .ok()
         };
         let Some(path) = file else { return Ok(Self { robot: of_rows(), urdf: None }) };
-        let hint = "correct the skin's path, or take the key out";
+        let hint = "correct the path in the skin, or remove the key";
         let wrong = |error: &dyn Display| Failure::usage_error(format!("robot.urdf: {error}; {hint}"));
         let (urdf, text) = read_urdf(path).map_err(|error| wrong(&error))?;
         let robot = RecordedRobot::from_urdf(skin, urdf, text.clone());
         let robot = robot.or_else(|error| {
-            print_note(format_args!("robot.urdf: {error}; the robot is shown by the skin's rows"));
+            print_note(format_args!("robot.urdf: {error}; the robot is drawn from the skin's rows instead"));
             of_rows().ok_or(())
         });
         Ok(Self { robot: robot.ok(), urdf: Some(text) })

@@ -96,7 +96,8 @@ enum SplitLimit {
 }
 
 fn limit(text: &str) -> Result<SplitLimit, String> {
-    let allowed = "a size from 1MB on (500MB, 2GiB) or a time from 1s on (90s, 10min, 2h)";
+    let allowed =
+        "use a size of at least 1MB, such as 500MB or 2GiB, or a time of at least 1s, such as 90s or 10min";
     let unit = text.trim_start_matches(|letter: char| letter.is_ascii_digit());
     let number: Option<u64> = text.strip_suffix(unit).and_then(|number| number.parse().ok());
     let bytes = [("MB", 1_000_000), ("MiB", 1 << 20), ("GB", 1_000_000_000), ("GiB", 1 << 30)];
@@ -146,7 +147,7 @@ fn demo_bus_kinds_help() -> String {
     format!("{names}; auto is SocketCAN if an interface vcan0 exists [default: embedded]")
 }
 
-/// Run a demonstration: 253 cells on an arm, touched here and there
+/// Run a demonstration: 253 cells on a robot arm, some of them touched
 ///
 /// Needs no setup: the cells are processes on an embedded bus of the demonstration's own, unless SKINBUS_DIR names a
 /// directory, so any number of demonstrations and runs can go on side by side. Prints the command that shows the frames
@@ -199,7 +200,7 @@ pub(crate) struct RunCommand {
     candump: Option<PathBuf>,
     #[command(flatten)]
     kinds: BusKinds,
-    /// Start no cells: they are already on the bus, or are real
+    /// Start no cells: real ones, or ones that run already, are on the bus
     #[arg(long)]
     no_spawn: bool,
     /// Let cells keep their parameters in files of this directory
@@ -243,7 +244,7 @@ impl DemoCommand {
         let place = place.filter(|_| !kind.is_interface()).unwrap_or_default();
         options
             .announced
-            .push(format!("to see its frames decoded: {place}skinbus dump vcan0 --bus-kind {kind}"));
+            .push(format!("to see the decoded frames: {place}skinbus dump vcan0 --bus-kind {kind}"));
         let CommonOptions { recording, summary, verbose, view, listen, .. } = self.common;
         let numbered = self.candump.is_none();
         let path = self.candump.unwrap_or_else(|| DEMO_LOG.into());

@@ -17,8 +17,10 @@ use super::arguments::{FORMATS, OptionValue, one_of_values};
 use super::output::OverwriteOption;
 pub(crate) use show::still_page;
 
-const REPLIES: &[OptionValue<Answers>] =
-    &[("torque", "Each cell its own torque", Answers::Torque), ("sum", "Sums along the tree", Answers::Sum)];
+const REPLIES: &[OptionValue<Answers>] = &[
+    ("torque", "Each cell sends its own torque", Answers::Torque),
+    ("sum", "Cells send sums along the tree", Answers::Sum),
+];
 
 /// Create and draw skins, and convert them to URDF and DBC
 #[derive(Args, Debug)]
@@ -38,7 +40,7 @@ enum SkinSubcommand {
 
 /// Describe a skin of hexagonal cells on the arm of a UR5
 ///
-/// Equal options give equal texts, whose first line is the command that generates it.
+/// The same options give the same text, whose first line is the command that generates it.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus skin generate -o skin.toml

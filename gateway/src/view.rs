@@ -139,11 +139,11 @@ impl ViewCommand {
             [one, ..] if !one.exists() => self.skin_on_named_buses()?,
             [one] if self.skin.is_none() && self.at.is_none() => self.read_skin_with_meshes(one)?,
             [one] => {
-                let why = "is for a recording, and this is a skin";
+                let why = "is only for a recording or a bus, but this file is a skin: leave it out";
                 return Err(Failure::usage_error(format!("{}: --skin or --at {why}", one.display())));
             }
             _ => {
-                let why = "several files are the parts of one recording, and a skin is shown alone";
+                let why = "several files must be the parts of one recording, but the first is a skin: name it alone";
                 return Err(Failure::usage_error(why));
             }
         };
@@ -174,7 +174,9 @@ impl ViewCommand {
             )));
         };
         if self.at.is_some() {
-            return Err(Failure::usage_error("--at is for a recording, not for live buses"));
+            return Err(Failure::usage_error(
+                "--at is only for a recording, not for live buses: leave it out",
+            ));
         }
         let (skin, surface) = self.read_skin_with_meshes(file)?;
         let of = |source: &PathBuf| find_bus(&skin, &file.display().to_string(), &source.to_string_lossy());
@@ -223,7 +225,8 @@ impl ViewCommand {
                 let skin = skin_of_recording(&self.sources)?;
                 if skin.robot.urdf.is_some() {
                     print_note(
-                        "the recording does not have the robot's meshes: with the --skin beside its URDF they are shown",
+                        "the recording does not contain the robot's meshes: to show them, name with --skin the skin \
+                         beside its URDF",
                     );
                 }
                 Ok((skin, Vec::new()))
@@ -259,7 +262,7 @@ fn bind_error(listen: SocketAddr, error: &io::Error) -> Failure {
     let hint = if is(io::ErrorKind::AddrNotAvailable) {
         "name an address of this machine"
     } else if is(io::ErrorKind::PermissionDenied) {
-        "name a port from 1024 on"
+        "name a port of at least 1024"
     } else {
         "name another port"
     };

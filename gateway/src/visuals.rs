@@ -32,7 +32,7 @@ fn package(text: &str) -> Result<(String, PathBuf), String> {
         Some((name, folder)) if !name.is_empty() && !folder.is_empty() => {
             Ok((name.to_owned(), folder.into()))
         }
-        _ => Err("NAME=DIR, the package of package://NAME/... and its folder".to_owned()),
+        _ => Err("use NAME=DIR: the package of package://NAME/... and its directory".to_owned()),
     }
 }
 

@@ -181,7 +181,7 @@ impl Bus {
     /// # Errors
     /// Returns an error if the kernel does not report the type of the interface.
     pub fn is_virtual(&self) -> Result<bool, BusError> {
-        self.backend().is_virtual(&self.name).map_err(|error| self.io_error("look at", error))
+        self.backend().is_virtual(&self.name).map_err(|error| self.io_error("query", error))
     }
 
     const fn backend(&self) -> &'static dyn BusBackend {

@@ -208,7 +208,7 @@ def main(dbc, golden):
             except cantools.database.errors.DecodeError:
                 compared["unknown"] = compared.get("unknown", 0) + 1
                 continue
-            raise SystemExit(f"{comment}: decoded")
+            raise SystemExit(f"{comment}: the DBC decoded a frame that it must not know")
         said = message.decode(data, decode_choices=False)
         name, expected = meaning(kind, fields)
         assert message.name == name, f"{comment}: {message.name}"

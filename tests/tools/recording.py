@@ -194,7 +194,8 @@ def compare(path):
             pose = still.pose(name, root)
             worst = max(worst, np.abs(pose.translation - place).max(), np.abs(pose.rotation[:, 2] - normal).max())
     unknown = named - {root, *still.parents}
-    print(f"{len(moving)} poses of {len(still.parents)} frames on {root}, at most {worst:.1e} apart; {len(named)} frames named")
+    print(f"{len(moving)} poses of {len(still.parents)} frames on {root}, at most {worst:.1e} apart; "
+          f"messages name {len(named)} frames")
     assert moving and not unknown and worst < 1e-6, (len(moving), unknown, worst)
 
 

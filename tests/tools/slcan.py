@@ -68,7 +68,7 @@ def main() -> None:
         for _ in range(int(count)):
             message = bus.recv(30)
             if message is None:
-                sys.exit("no frame came for 30 s")
+                sys.exit("no frame arrived for 30 s")
             print(written(message), flush=True)
         sender.join()
 

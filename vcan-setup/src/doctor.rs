@@ -149,21 +149,21 @@ impl MachineFacts {
         let hints = || self.kernel.setup_hints(*can_raw);
         match (self.choice, has_can) {
             (KindChoice::Only(kind), _) if !kind.is_interface() => {
-                Finding::ok(format!("{} was chosen, which needs no support by the kernel", kind.display_name()))
+                Finding::ok(format!("{} was requested, which needs no kernel support", kind.display_name()))
             }
             (KindChoice::Auto | KindChoice::Only(_), true) => {
-                Finding::ok(format!("the kernel ({release}) has CAN"))
+                Finding::ok(format!("the kernel ({release}) supports CAN"))
             }
             (KindChoice::Auto, false) => Finding::note(format!(
-                "the kernel ({release}) has no CAN, so the bench runs on the embedded bus: no candump, no real cell; \
-                 for a kernel with CAN:"
+                "the kernel ({release}) does not support CAN, so the bench uses the embedded bus, without \
+                 candump and real cells; to get a kernel with CAN:"
             ))
             .with_hints(hints()),
-            (KindChoice::Only(_), false) => {
-                Finding::fault(format!("the kernel ({release}) has no CAN, and --bus-kind socketcan needs it"))
-                    .with_hints(hints())
-                    .with_hint("# leave out --bus-kind socketcan: the bench then runs on the embedded bus")
-            }
+            (KindChoice::Only(_), false) => Finding::fault(format!(
+                "the kernel ({release}) does not support CAN, which --bus-kind socketcan needs"
+            ))
+            .with_hints(hints())
+            .with_hint("# or leave out --bus-kind socketcan: the bench then uses the embedded bus"),
         }
     }
 
@@ -179,7 +179,7 @@ impl MachineFacts {
         let (all, count) = (format_node_ids(&heard.cells), heard.cells.len());
         let gateway = heard.gateway.then(|| {
             Finding::fault(format!("another gateway sends joints on {on}"))
-                .with_hint("pgrep -a skinbus  # and stop it, or take another bus")
+                .with_hint("pgrep -a skinbus  # shows the gateway: stop it, or use another bus")
         });
         let absent = || {
             let missing = |cells: &BTreeSet<_>| cells.difference(&heard.cells).copied().collect();
@@ -187,8 +187,9 @@ impl MachineFacts {
         };
         let cells = match (self.no_spawn, count) {
             (false, 0) => None,
-            (false, 1..) => Some(Finding::fault(format!("cells are on {on} already: {all}")).with_hint(
-                "skinbus run ... --no-spawn  # and doctor ... --no-spawn, to use them; or stop them",
+            (false, 1..) => Some(Finding::fault(format!("cells are already on {on}: {all}")).with_hint(
+                "skinbus run ... --no-spawn  # uses these cells (check with doctor ... --no-spawn); or stop \
+                 them",
             )),
             (true, 0) => Some(
                 Finding::fault(format!("no cell sends on {on}, but --no-spawn needs running cells"))
@@ -219,18 +220,20 @@ impl MachineFacts {
         let hint = self.with_sudo(&format!("sysctl -w net.core.rmem_max={needed}"));
         Some(if granted >= needed {
             Finding::ok(format!(
-                "receive buffers of {has} KiB hold all answers ({frames} frames) {BUFFERED_REPLIES_PER_CELL} times"
+                "receive buffers of {has} KiB can hold the answers of all cells ({frames} frames) \
+                 {BUFFERED_REPLIES_PER_CELL} times"
             ))
         } else if granted >= frames * FRAME_BUFFER_BYTES {
             Finding::note(format!(
-                "receive buffers are limited to {has} KiB; to hold all answers ({frames} frames) {BUFFERED_REPLIES_PER_CELL} times, they need \
-                 {wants} KiB, else a delayed gateway loses answers"
+                "receive buffers are limited to {has} KiB; to hold the answers of all cells ({frames} \
+                 frames) {BUFFERED_REPLIES_PER_CELL} times, they need {wants} KiB, otherwise a delayed \
+                 gateway loses answers"
             ))
             .with_hint(hint)
         } else {
             Finding::fault(format!(
-                "receive buffers are limited to {has} KiB and cannot hold all answers ({frames} frames) even once; \
-                 {wants} KiB are needed"
+                "receive buffers are limited to {has} KiB and cannot hold the answers of all cells ({frames} \
+                 frames) even once; they need {wants} KiB"
             ))
             .with_hint(hint)
         })
@@ -245,14 +248,15 @@ impl MachineFacts {
             return None;
         }
         Some(match self.backlog {
-            None => Finding::note("the kernel's backlog cannot be seen from this network namespace")
-                .with_hint("sysctl net.core.netdev_max_backlog  # in the first one"),
+            None => Finding::note("the kernel's receive backlog cannot be read in this network namespace")
+                .with_hint("sysctl net.core.netdev_max_backlog  # in the initial network namespace"),
             Some(backlog) if backlog >= frames => Finding::ok(format!(
-                "the kernel's backlog of {backlog} holds the answers of all cells ({frames} frames)"
+                "the kernel's receive backlog of {backlog} can hold the answers of all cells ({frames} \
+                 frames)"
             )),
             Some(backlog) => Finding::fault(format!(
-                "the kernel's backlog of {backlog} does not hold the answers of all cells ({frames} frames): some would \
-                 be lost silently"
+                "the kernel's receive backlog of {backlog} cannot hold the answers of all cells ({frames} \
+                 frames): some would be lost silently"
             ))
             .with_hint(self.with_sudo(&format!("sysctl -w net.core.netdev_max_backlog={}", 2 * frames))),
         })
@@ -271,9 +275,10 @@ impl MachineFacts {
             format!("cell-node is not at {}: the gateway starts it from its own directory", path.display());
         match (self.no_spawn, there) {
             (true, _) => None,
-            (false, true) => Some(Finding::ok("cell-node is beside vcan-setup")),
+            (false, true) => Some(Finding::ok("cell-node is in the directory of vcan-setup")),
             (false, false) => Some(Finding::fault(absent).with_hint(
-                "cargo build --release  # in the project's folder; or name it in SKINBUS_CELL_NODE",
+                "cargo build --release  # in the project's folder; or set SKINBUS_CELL_NODE to the path of \
+                 cell-node",
             )),
         }
     }

@@ -74,11 +74,11 @@ impl Kernel {
             ModuleState::Available => None,
             ModuleState::Loadable => Some(modprobe.to_owned()),
             ModuleState::Missing => Some(self.other_kernel_hint(modprobe)),
-            ModuleState::Unknown => Some(format!(
-                "{modprobe}  # on the host, if this is a container: the modules are on the host"
-            )),
+            ModuleState::Unknown => {
+                Some(format!("{modprobe}  # in a container: run this on the host, which has the modules"))
+            }
         };
-        let lab = "tests/lab/run COMMAND  # in the project's folder: runs it in a machine that has vcan";
+        let lab = "tests/lab/run COMMAND  # in the project's folder: runs COMMAND in a virtual machine that has vcan";
         here.into_iter().chain([lab.to_owned()]).collect()
     }
 
@@ -99,10 +99,13 @@ impl Kernel {
             return format!("sudo apt install linux-modules-extra-{release} && {modprobe}");
         }
         if is("debian") && release.ends_with(architecture) {
-            let cloud =
-                if release.contains("cloud") { "a generic kernel, not a cloud one" } else { "a newer one" };
+            let cloud = if release.contains("cloud") {
+                "a generic kernel instead of a cloud kernel"
+            } else {
+                "a newer kernel"
+            };
             return format!(
-                "sudo apt install linux-image-{architecture}  # {cloud}: boot it, then {modprobe}"
+                "sudo apt install linux-image-{architecture}  # {cloud}: boot it, then run {modprobe}"
             );
         }
         "# boot a kernel with CONFIG_CAN_RAW and CONFIG_CAN_VCAN".to_owned()
@@ -205,8 +208,8 @@ mod tests {
         let debian = "PRETTY_NAME=\"Debian\"\nID=debian\nVERSION_ID=\"12\"\n";
         assert_eq!(
             first("6.1.0-30-cloud-amd64", debian, ModuleState::Missing),
-            "sudo apt install linux-image-amd64  # a generic kernel, not a cloud one: boot it, then sudo modprobe \
-             -a can_raw vcan vxcan"
+            "sudo apt install linux-image-amd64  # a generic kernel instead of a cloud kernel: boot it, then \
+             run sudo modprobe -a can_raw vcan vxcan"
         );
         let mint = "NAME=\"Linux Mint\"\nID=linuxmint\nID_LIKE=\"ubuntu debian\"\n";
         assert_eq!(

@@ -88,7 +88,7 @@ fn observe_all_buses(
         let begun: Vec<_> = buses.iter().map(begin).collect();
         let end = |thread: io::Result<ScopedJoinHandle<'_, _>>| match thread.map(ScopedJoinHandle::join) {
             Ok(Ok(heard)) => heard,
-            Ok(Err(_)) => Err("the thread that listened panicked".to_owned()),
+            Ok(Err(_)) => Err("the thread that listened on the bus panicked".to_owned()),
             Err(error) => Err(format!("cannot start a thread: {error}")),
         };
         begun.into_iter().map(|thread| thread.map(end)).collect()
@@ -187,7 +187,10 @@ fn embedded_directory() -> Result<PathBuf, String> {
             let parent = directory.parent().unwrap_or_else(|| Path::new("/"));
             rustix::fs::access(parent, Access::WRITE_OK | Access::EXEC_OK).map_err(|errno| {
                 let (directory, why) = (directory.display(), io::Error::from(errno));
-                format!("cannot make {directory} for embedded buses: {why}; set SKINBUS_DIR to a directory of your own")
+                format!(
+                    "cannot create {directory} for embedded buses: {why}; set SKINBUS_DIR to a directory of \
+                     your own"
+                )
             })?;
         }
         Err(error) => return Err(error.to_string()),

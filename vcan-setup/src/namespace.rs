@@ -28,7 +28,8 @@ pub enum Namespace {
 pub enum NamespaceError {
     /// There is no namespace of this name.
     #[error(
-        "there is no network namespace {name} in {NAMESPACE_DIRECTORY}: `sudo ip netns add {name}` makes it, `ip netns` lists them; a process id or a path is accepted too"
+        "there is no network namespace {name} in {NAMESPACE_DIRECTORY}: `ip netns` lists namespaces, `sudo \
+         ip netns add {name}` creates it; a process id or a path is accepted too"
     )]
     Name {
         /// The name.
@@ -36,7 +37,8 @@ pub enum NamespaceError {
     },
     /// There is neither a namespace nor a process with this number.
     #[error(
-        "there is no network namespace {pid} in {NAMESPACE_DIRECTORY}, and no process {pid}: is it still running? `ip netns` lists names"
+        "there is neither a network namespace {pid} in {NAMESPACE_DIRECTORY} nor a process {pid}: check the \
+         process id; `ip netns` lists namespaces"
     )]
     Process {
         /// The process id.
@@ -136,9 +138,9 @@ mod tests {
     #[test]
     fn one_that_is_not_there_says_how_to_make_it() {
         let error = Namespace::parse(OsStr::new("nosuchspace")).open().unwrap_err().to_string();
-        assert!(error.contains("`sudo ip netns add nosuchspace` makes it"), "{error}");
+        assert!(error.contains("`sudo ip netns add nosuchspace` creates it"), "{error}");
         let error = Namespace::parse(OsStr::new("4294967295")).open().unwrap_err().to_string();
-        assert!(error.contains("no process 4294967295"), "{error}");
+        assert!(error.contains("nor a process 4294967295"), "{error}");
         let error = Namespace::parse(OsStr::new("/nowhere/ns")).open().unwrap_err().to_string();
         assert!(error.starts_with("cannot open the network namespace /nowhere/ns: No such file"), "{error}");
     }

@@ -60,7 +60,9 @@ impl Netlink {
             Self::open()
         };
         thread::scope(|scope| thread::Builder::new().spawn_scoped(scope, enter).map(ScopedJoinHandle::join))?
-            .unwrap_or_else(|_| Err(io::Error::other("the thread that entered it panicked")))
+            .unwrap_or_else(|_| {
+                Err(io::Error::other("the thread that entered the network namespace panicked"))
+            })
     }
 
     /// Returns all interfaces of the namespace, sorted by index.
@@ -272,7 +274,10 @@ impl Netlink {
             .query_interface(link_message(index, []))?
             .and_then(|it| it.hardware().map(CanHardware::bit_rates));
         match nearest.filter(|nearest| !nearest.matches(target)) {
-            Some(nearest) => Err(io::Error::other(format!("the nearest that its clock allows is {nearest}"))),
+            Some(nearest) => {
+                let why = format!("the nearest bit rates that its clock allows are {nearest}");
+                Err(io::Error::other(why))
+            }
             None => Ok(()),
         }
     }

@@ -202,7 +202,10 @@ pub fn plan_pair_up(target: &TargetPair<'_>, present: &[Interface]) -> Result<Pl
     let (what, command) = match (other.up, other.mtu >= FD_MTU) {
         (true, true) => return Ok(plan),
         (false, true) => ("down".to_owned(), format!("{ip} link set {peer} up")),
-        (_, false) => (format!("of MTU {}", other.mtu), format!("sh -c '{}'", set_fd_mtu_command(&ip, peer))),
+        (_, false) => (
+            format!("too small for CAN FD, with MTU {}", other.mtu),
+            format!("sh -c '{}'", set_fd_mtu_command(&ip, peer)),
+        ),
     };
     let end = format!("{peer} in {}, is {what}", there.name);
     Err(PlanRefusal::OtherEnd { name: name.to_owned(), end, command })
@@ -285,7 +288,7 @@ impl Plan {
         let wide = target.fits_mtu(interface.mtu);
         if agrees && wide && interface.up {
             let checked = if rates.bitrate.is_some() { ", as the skin requires" } else { "" };
-            self.add_unchanged(format!("{name} is {what}, at {before}{checked}, and is left as it is"));
+            self.add_unchanged(format!("{name} is {what}, runs at {before}{checked}, and stays unchanged"));
             return Ok(());
         }
         let needs_data = target.format == Format::Fd;
@@ -330,7 +333,7 @@ pub fn plan_down(target: &[InterfaceTarget], present: &[Interface]) -> Result<Pl
             continue;
         }
         match (find_interface(present, &name), &target.skin) {
-            (None, _) => plan.add_unchanged(format!("{name} is not there")),
+            (None, _) => plan.add_unchanged(format!("{name} does not exist")),
             (Some(interface), _) if interface.ours && interface.is_virtual() => {
                 if !is_removed_with_peer(&plan, interface, present) {
                     plan.steps.push(Step { name, action: StepAction::Remove { index: interface.index } });
@@ -339,7 +342,7 @@ pub fn plan_down(target: &[InterfaceTarget], present: &[Interface]) -> Result<Pl
             (Some(interface), Some(_)) => {
                 let what = interface.description();
                 plan.add_unchanged(format!(
-                    "{name} is {what} that vcan-setup has not made, and is left alone"
+                    "{name} is {what} that vcan-setup did not make, so it stays unchanged"
                 ));
             }
             (Some(interface), None) => {

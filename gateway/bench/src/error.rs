@@ -46,12 +46,12 @@ pub enum RunError {
     #[error(transparent)]
     TooDeep(#[from] TreeTooDeep),
     /// The directory for the cells' parameters cannot be used.
-    #[error("--flash {}: there is no such directory; make it first", .0.display())]
+    #[error("--flash {}: this directory does not exist; create it first", .0.display())]
     NoFlash(PathBuf),
     /// A scenario asks for a fault that only a simulated bus can make.
     #[error(
-        "the fault {kind:?} of {bus} at {at_s} s works only in virtual time; a run with processes supports kill, stop, \
-         continue, restart, link_down, link_up, stuck and drift"
+        "the scenario's fault {kind:?} of {bus} at {at_s} s works only in virtual time; a run with processes supports \
+         kill, stop, continue, restart, link_down, link_up, stuck and drift"
     )]
     BusFault {
         /// Kind of the fault, as in the file.
@@ -64,14 +64,14 @@ pub enum RunError {
     /// Simulated wires must not be used on a real bus.
     #[error(
         "{0} is real hardware, but cells that answer with sums simulate their wires with frames that must not be sent \
-         there: use a vcan or the embedded bus, or reply = \"torque\""
+         there: use a vcan or the embedded bus, or set reply = \"torque\" in the skin"
     )]
     RealWires(String),
     /// Signals cannot be caught.
     #[error(transparent)]
     Signal(#[from] SignalError),
     /// A signal ended the run before it began.
-    #[error("interrupted while starting")]
+    #[error("the run was interrupted while it was starting")]
     Interrupted,
     /// The system grants no thread.
     #[error(transparent)]
@@ -87,7 +87,7 @@ pub enum RunError {
     OtherGateway(Option<(String, BusKind)>),
     /// Other cells are on a bus on which cells were to be started.
     #[error(
-        "cells are on the bus already: {cells}; use them with --no-spawn, {}",
+        "these cells are already on the bus: {cells}; use them with --no-spawn, {}",
         if *.embedded { format!("stop them, or {OTHER_DIRECTORY_HINT}") } else { "or stop them".to_owned() }
     )]
     CellsPresent {
@@ -98,14 +98,14 @@ pub enum RunError {
     },
     /// Cells have no parameters.
     #[error(
-        "cells without parameters: {0}; write them with `skinbus commission`, or delete their flash files if these are \
-         damaged"
+        "these cells have no parameters: {0}; write the parameters with `skinbus commission`, or delete the cells' \
+         flash files if these are damaged"
     )]
     Unconfigured(String),
     /// Cells do not answer.
     #[error(
-        "cells that are not ready: {cells}; {}",
-        if *.spawned { "see their own messages above" } else { "start them with cell-node, or leave out --no-spawn" }
+        "these cells are not ready: {cells}; {}",
+        if *.spawned { "see their own messages above" } else { "start them with cell-node, or omit --no-spawn" }
     )]
     NotReady {
         /// The cells.
@@ -115,7 +115,7 @@ pub enum RunError {
     },
     /// Cells are configured for another skin.
     #[error(
-        "cells that are not configured for {}: {cells}; configure them with `skinbus commission`, or \
+        "these cells are not configured for {}: {cells}; configure them with `skinbus commission`, or \
          delete their flash files",
         .skin.display()
     )]
@@ -126,7 +126,10 @@ pub enum RunError {
         cells: String,
     },
     /// The process of a cell ended too early.
-    #[error("{cells} ended while starting ({status}){}", reason_suffix(.said.as_deref()))]
+    #[error(
+        "the process of {cells} ended while it was starting ({status}){}",
+        reason_suffix(.said.as_deref())
+    )]
     Ended {
         /// The cells of the process.
         cells: String,
@@ -142,13 +145,13 @@ pub enum RunError {
     #[error("{0}")]
     BrokenTree(String),
     /// Cells do not answer with sums.
-    #[error("cells that do not switch to sums (parameter 6): {0}; install firmware that supports sums")]
+    #[error("these cells did not switch to sums (parameter 6): {0}; install firmware that supports sums")]
     NoSums(String),
     /// A thread panicked.
     #[error("the {0} panicked")]
     Panicked(&'static str),
     /// A receiver ended.
-    #[error("a receiver ended while the loop ran")]
+    #[error("a receiver thread ended while the control loop was running")]
     ReceiverEnded,
 }
 
@@ -219,7 +222,7 @@ fn other_gateway(link: Option<&(String, BusKind)>) -> String {
         None => "another gateway is on the bus".to_owned(),
         Some((name, kind)) => {
             let elsewhere =
-                if kind.is_interface() { "give this one another bus" } else { OTHER_DIRECTORY_HINT };
+                if kind.is_interface() { "run this one on another bus" } else { OTHER_DIRECTORY_HINT };
             format!("another gateway is on {name}: stop one of the two, or {elsewhere}")
         }
     }

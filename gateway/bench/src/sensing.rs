@@ -41,7 +41,7 @@ pub enum SensingError {
     #[error(transparent)]
     Bus(#[from] BusError),
     /// No cell answered.
-    #[error("{who} answers on {bus}: start it, or give the bus's format with --format {other}")]
+    #[error("no answer from {who} on {bus}: start the cell, or give the bus's format with --format {other}")]
     NoAnswer {
         /// Description of the addressed cells.
         who: String,
@@ -51,7 +51,9 @@ pub enum SensingError {
         other: &'static str,
     },
     /// Some cells refused.
-    #[error("{cells} on {bus} refused with reason {reason}: docs/reference/protocol.md explains it")]
+    #[error(
+        "{cells} on {bus} refused the command with reason {reason}: docs/reference/protocol.md lists the reasons"
+    )]
     Refused {
         /// The cells as text.
         cells: String,
@@ -62,7 +64,7 @@ pub enum SensingError {
     },
     /// Some cells are present but did not answer.
     #[error(
-        "{cells} on {bus} did not answer, but {done} did: switch the silent ones again when they are back"
+        "{cells} on {bus} did not answer, but {done} did: repeat the command for the others when they send again"
     )]
     Silent {
         /// The cells as text.
@@ -121,7 +123,7 @@ fn switch_result(
 ) -> Result<String, SensingError> {
     let (bus, missing) = (bus.to_owned(), answers.missing_cells());
     if answers.received_answers().is_empty() {
-        let who = only.map_or_else(|| "no cell".to_owned(), |cell| format!("no cell {cell}"));
+        let who = only.map_or_else(|| "any cell".to_owned(), |cell| format!("cell {cell}"));
         return Err(SensingError::NoAnswer { who, bus, other: format.other_format().name() });
     }
     let (mut confirmed, mut refused) = (BTreeSet::new(), BTreeMap::new());
@@ -193,8 +195,7 @@ mod tests {
         }
         assert!(!have_all_cells_answered(&answers, None, true));
         assert_eq!(answers.missing_cells(), [cell(3)].into(), "the answer to another sender does not count");
-        let why =
-            "cell 3 on vcan0 did not answer, but 2 did: switch the silent ones again when they are back";
+        let why = "cell 3 on vcan0 did not answer, but 2 did: repeat the command for the others when they send again";
         assert_eq!(says(&answers, None), Err(why.to_owned()));
         answers.record_message(&confirms(3, SENSING_REQUEST_TAG));
         assert!(
@@ -209,7 +210,8 @@ mod tests {
         let mut answers = ReceivedAnswers::new(only, Some(SENSING_REQUEST_TAG));
         answers.record_message(&confirms(1, SENSING_REQUEST_TAG));
         assert_eq!(answers.missing_cells(), [cell(7)].into());
-        let why = "no cell 7 answers on vcan0: start it, or give the bus's format with --format classic";
+        let why =
+            "no answer from cell 7 on vcan0: start the cell, or give the bus's format with --format classic";
         assert_eq!(says(&answers, only), Err(why.to_owned()));
         answers.record_message(&confirms(7, SENSING_REQUEST_TAG));
         assert!(have_all_cells_answered(&answers, only, false));
@@ -221,7 +223,7 @@ mod tests {
         let mut answers = ReceivedAnswers::new(None, Some(SENSING_REQUEST_TAG));
         let answer = Answer::Refused { number: 7, reason: Answer::REFUSED_UNKNOWN_PARAMETER };
         answers.record_message(&Message::Configured { from: cell(9), tag: SENSING_REQUEST_TAG, answer });
-        let why = "cell 9 on vcan0 refused with reason 18: docs/reference/protocol.md explains it";
+        let why = "cell 9 on vcan0 refused the command with reason 18: docs/reference/protocol.md lists the reasons";
         assert_eq!(says(&answers, None), Err(why.to_owned()));
     }
 }

@@ -119,8 +119,8 @@ impl Summary {
         let halted = self.halts.last().filter(|_| self.halted.is_some()).map(|halted| {
             let HaltSummary { at_s, epoch, reason, .. } = halted;
             format!(
-                "the robot was halted at {at_s:.3} s (epoch {epoch}) and not resumed: {reason}; --summary FILE keeps \
-                 the ticks before it"
+                "the robot was halted at {at_s:.3} s (epoch {epoch}) and not resumed: {reason}; --summary FILE saves \
+                 the ticks before the halt"
             )
         });
         let absent = self.no_controller.clone();
@@ -133,7 +133,7 @@ impl Summary {
     fn lost_buses(&self) -> Option<String> {
         let lost: Vec<_> = self.buses.iter().filter(|bus| bus.outages.at_end).collect();
         let names = || lost.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
-        (!lost.is_empty()).then(|| format!("lost at the end of the run: {}", names()))
+        (!lost.is_empty()).then(|| format!("these buses were lost at the end of the run: {}", names()))
     }
 
     fn lost_frames(&self) -> Option<String> {
@@ -149,7 +149,7 @@ impl Summary {
         let parts: String = parts.map(hint).collect();
         (!errors.is_empty() || *lost_write > 0).then(|| match lost_write {
             0 => format!("the recording has an error: {first}{parts}"),
-            _ => format!("the recording is incomplete, {lost_write} frames were not written: {first}{parts}"),
+            _ => format!("the recording is incomplete: {lost_write} frames were not written: {first}{parts}"),
         })
     }
 }

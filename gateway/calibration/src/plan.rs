@@ -45,7 +45,9 @@ pub struct PlanBounds {
 #[derive(Clone, Debug, Error, PartialEq)]
 pub enum PlanError {
     /// The center has too few or too many joints.
-    #[error("the pose has {got} positions; the robot has {joints} joints: give one for each")]
+    #[error(
+        "the pose has {got} positions, but the robot has {joints} joints: give one position for each joint"
+    )]
     Joints {
         /// The number of positions.
         got: usize,
@@ -53,7 +55,7 @@ pub enum PlanError {
         joints: usize,
     },
     /// A joint is outside its limits.
-    #[error("joint {name} at {got}: its limits are {min} to {max}; choose a position between them")]
+    #[error("joint {name} cannot be at {got}: its limits are {min} to {max}; choose a position between them")]
     Limits {
         /// The joint.
         name: String,
@@ -65,7 +67,7 @@ pub enum PlanError {
         max: f64,
     },
     /// The duration is too short or too long.
-    #[error("a motion of {got} s is too short or too long: choose 20 to 3600 s")]
+    #[error("the motion cannot last {got} s: choose 20 to 3600 s")]
     Length {
         /// The duration in s.
         got: f64,
@@ -454,11 +456,14 @@ mod tests {
             plan_motion(&skin, &bounds, &DataSheet::default(), [0.0, 0.0, -STANDARD_GRAVITY]).unwrap_err();
         assert_eq!(
             error.to_string(),
-            "joint joint4 at 0.5: its limits are -3.0718 to -0.0698; choose a position between them"
+            "joint joint4 cannot be at 0.5: its limits are -3.0718 to -0.0698; choose a position between them"
         );
         bounds.center.pop();
         let error =
             plan_motion(&skin, &bounds, &DataSheet::default(), [0.0, 0.0, -STANDARD_GRAVITY]).unwrap_err();
-        assert_eq!(error.to_string(), "the pose has 6 positions; the robot has 7 joints: give one for each");
+        assert_eq!(
+            error.to_string(),
+            "the pose has 6 positions, but the robot has 7 joints: give one position for each joint"
+        );
     }
 }

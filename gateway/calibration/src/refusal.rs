@@ -59,17 +59,12 @@ impl core::fmt::Display for GapSummary {
         let Self { broadcasts, left_out, gaps, .. } = self;
         match (gaps, self.longest_ms.zip(self.longest_at_s)) {
             (1.., Some((ms, at))) => {
-                let of = if *gaps == 1 {
-                    "1 gap in the broadcasts, of"
-                } else {
-                    "gaps in the broadcasts, the longest of"
-                };
-                let many = if *gaps == 1 { String::new() } else { format!("{gaps} ") };
-                write!(f, "{many}{of} {ms} ms after {at} s")?;
+                let gaps = if *gaps == 1 { "1 gap".to_owned() } else { format!("{gaps} gaps, the longest") };
+                write!(f, "the joint broadcasts have {gaps} of {ms} ms at {at} s")?;
             }
-            _ => f.write_str("no gap in the broadcasts")?,
+            _ => f.write_str("the joint broadcasts have no gap")?,
         }
-        write!(f, "; {left_out} of {broadcasts} broadcasts are left out")
+        write!(f, "; {left_out} of {broadcasts} broadcasts are not used")
     }
 }
 
@@ -78,7 +73,8 @@ impl core::fmt::Display for GapSummary {
 pub enum Refusal {
     /// The joints on a bus are those of another robot.
     #[error(
-        "{bus}: its frames carry {got} joints, but the skin has {joints}: calibrate with the skin that was recorded"
+        "{bus}: the recorded frames have {got} joints, but the skin has {joints}: give the skin with which \
+         the recording was made"
     )]
     Joints {
         /// The bus.
@@ -90,7 +86,8 @@ pub enum Refusal {
     },
     /// The broadcast rate of joints differs from the skin's.
     #[error(
-        "{bus}: joints were broadcast {got} times a second, but the skin has {hz}: correct joint_broadcast_hz"
+        "{bus}: joints were broadcast {got} times a second, but the skin specifies {hz}: correct \
+         joint_broadcast_hz in the skin"
     )]
     Rate {
         /// The bus.
@@ -102,7 +99,8 @@ pub enum Refusal {
     },
     /// The motion is known for too few broadcasts.
     #[error(
-        "{bus}: {disturbance}: too few broadcasts remain for a calibration; record longer, with a loop that skips no ticks"
+        "{bus}: {disturbance}, so that too few remain for a calibration; make a longer recording, in which \
+         the control loop skips no ticks"
     )]
     Disturbed {
         /// The bus.
@@ -112,8 +110,9 @@ pub enum Refusal {
     },
     /// The readings scatter more than the data sheet allows for sensors on this robot.
     #[error(
-        "readings scatter {times} times as much as the data sheet says ({noise_mg} mg; its noise is {sheet_mg} mg), so no pose can \
-         be trusted; {disturbance}; record again with a loop that skips no ticks, or name the sensors' data sheet with --data-sheet"
+        "the readings scatter {times} times as much as the data sheet states ({noise_mg} mg instead of \
+         {sheet_mg} mg), so no pose is reliable; {disturbance}; record again with a control loop that skips \
+         no ticks, or give the sensors' data sheet with --data-sheet"
     )]
     Scatter {
         /// The ratio of the scatter to the value that the data sheet predicts.
@@ -127,8 +126,8 @@ pub enum Refusal {
     },
     /// Readings before and after a gap were not taken at the times of their joints.
     #[error(
-        "{bus}: after {at_s} s readings lag {ms} ms more behind their joints than elsewhere, so no pose can be trusted; \
-         {disturbance}; record again with a loop that skips no ticks"
+        "{bus}: from {at_s} s on, readings lag {ms} ms more behind their joints than elsewhere, so no pose \
+         is reliable; {disturbance}; record again with a control loop that skips no ticks"
     )]
     Shifted {
         /// The bus.

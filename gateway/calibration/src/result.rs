@@ -168,31 +168,38 @@ pub enum Diagnosis {
 impl core::fmt::Display for Diagnosis {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         match self {
-            Self::Dead => f.write_str("dead: it sent no acceleration; its description is kept"),
-            Self::Stuck => f.write_str("stuck: it sent one acceleration only; its description is kept"),
+            Self::Dead => f.write_str("dead: it sent no acceleration; its pose in the skin is kept"),
+            Self::Stuck => {
+                f.write_str("stuck: it always sent the same acceleration; its pose in the skin is kept")
+            }
             Self::Silent { share } => {
                 write!(f, "silent: only {:.0} % of its readings arrived; check its wires", share * 100.0)
             }
-            Self::Still => f.write_str("no joint moves it; its description is kept"),
+            Self::Still => f.write_str("no joint moves it; its pose in the skin is kept"),
             Self::Joint { joint } => {
                 write!(
                     f,
-                    "joint {joint} explains its readings only slightly better than another joint: move joint {joint} more"
+                    "uncertain joint: joint {joint} explains its readings only slightly better than another \
+                     joint; move joint {joint} more"
                 )
             }
             Self::Loose { times } => {
                 write!(
                     f,
-                    "loose or damaged: its readings scatter {times} times as much as those of most cells; its description is kept"
+                    "loose or damaged: its readings scatter {times} times as much as those of most cells; \
+                     its pose in the skin is kept"
                 )
             }
             Self::Swapped { node } => {
-                write!(f, "swapped with node {node}: each sits where the skin has the other")
+                write!(f, "swapped with node {node}: each cell is where the skin describes the other")
             }
-            Self::Elsewhere { node } => write!(f, "it sits where the skin has node {node}"),
+            Self::Elsewhere { node } => {
+                write!(f, "at a wrong place: it is where the skin describes node {node}")
+            }
             Self::NotObservable { position_mm, orientation_deg, help } => write!(
                 f,
-                "not observable: pose known only within {position_mm} mm and {orientation_deg} degrees; {help}; its description is kept"
+                "not observable: its pose is known only within {position_mm} mm and {orientation_deg} \
+                 degrees; {help}; its pose in the skin is kept"
             ),
         }
     }

@@ -10,7 +10,7 @@ use crate::result::{Calibration, EstimatedCellPlace};
 #[derive(Debug, Error)]
 pub enum WriteError {
     /// The text differs from that of the skin that was read.
-    #[error("the text of the skin file does not match the skin that was read: {0}; calibrate again")]
+    #[error("the skin file does not match the skin that was calibrated: {0}; calibrate again")]
     Text(String),
 }
 
@@ -112,7 +112,8 @@ orientation = [0.0, 0.0, 0.0, 1.0]
         let error = calibrated_text(&skin, one, &calibration).unwrap_err();
         assert_eq!(
             error.to_string(),
-            "the text of the skin file does not match the skin that was read: it has 1 cells, not 2; calibrate again"
+            "the skin file does not match the skin that was calibrated: it has 1 cells, not 2; calibrate \
+             again"
         );
     }
 }

@@ -54,7 +54,8 @@ impl core::fmt::Display for ZeroOffset {
             Some(offset) => write!(f, "{joint}: zero offset {offset} {unit}, standard deviation {deviation}"),
             None => write!(
                 f,
-                "{joint}: its zero offset is not observable: cells mounted differently would give the same readings"
+                "{joint}: the zero offset is not observable, because cells mounted differently would give \
+                 the same readings"
             ),
         }
     }

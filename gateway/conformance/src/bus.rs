@@ -68,15 +68,15 @@ pub enum StopReason {
     #[error("{0}")]
     Bus(String),
     /// The cell has stopped sending.
-    #[error("the cell fell silent: it sent nothing for 3 s")]
+    #[error("the cell stopped sending: no frame arrived from it for 3 s")]
     Silent,
     /// Another program commands cells on this bus.
-    #[error("{0} was sent by another program: stop the gateway on this bus")]
+    #[error("another program sent frame {0} to the cells: stop the gateway on this bus")]
     Gateway(String),
     /// The command of a restart failed.
     #[error("{0}")]
     Restart(String),
     /// The time limit is reached.
-    #[error("the time limit was reached")]
+    #[error("the test reached its time limit")]
     Time,
 }

@@ -146,7 +146,8 @@ impl Findings {
     /// why the test ended early, if it did.
     #[must_use]
     pub fn requested_findings(&self, only: &RequirementFilter, stopped: Option<&StopReason>) -> Vec<Finding> {
-        let why = stopped.map_or_else(|| "there is no check for it".to_owned(), ToString::to_string);
+        let why = stopped
+            .map_or_else(|| "this program has no check for the requirement".to_owned(), ToString::to_string);
         let asked = REQUIREMENTS.iter().filter(|it| only.is_selected(it.id));
         asked
             .map(|requirement| Finding { requirement, verdict: self.verdict(requirement.id, &why) })

@@ -55,7 +55,7 @@ impl SocketBus {
         let probe = socket.is_virtual().unwrap_or(false).then(LatenessProbe::new).transpose();
         let probe = probe.map_err(|source| BusError::Io {
             name: name.to_owned(),
-            doing: "start a thread beside",
+            doing: "start a thread that watches delays for",
             source,
         })?;
         Ok(Self { socket, inbox, waiting, stopped, obeys_signals: true, late, probe, command, child: None })
@@ -100,7 +100,7 @@ impl TestBus for SocketBus {
             if self.inbox.dropped_count() > 0 {
                 let name = self.socket.name();
                 return Err(StopReason::Bus(format!(
-                    "{name}: frames were lost because they came faster than they were read"
+                    "{name}: frames were lost because they arrived faster than this program read them"
                 )));
             }
             if count == 0 {
@@ -133,14 +133,18 @@ impl TestBus for SocketBus {
 
     fn begin_restart(&mut self) -> Result<(), StopReason> {
         let Some(command) = &self.command else {
-            return Err(StopReason::Restart("a restart needs the option --restart".to_owned()));
+            return Err(StopReason::Restart(
+                "restarting the cell needs the option --restart COMMAND".to_owned(),
+            ));
         };
         let child = Command::new("sh")
             .args(["-c", command])
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .spawn()
-            .map_err(|error| StopReason::Restart(format!("--restart {command:?}: {error}")))?;
+            .map_err(|error| {
+                StopReason::Restart(format!("--restart {command:?}: cannot run the command: {error}"))
+            })?;
         self.child = Some((child, self.now()));
         Ok(())
     }

@@ -52,7 +52,7 @@ impl Session<'_> {
     /// Returns [`StopReason`] if the bus fails, or if the test is interrupted.
     pub fn save(&mut self) -> Result<Result<SavedCell, String>, StopReason> {
         let Reply::Value(identity) = self.read_parameter(Parameter::Identity.number())? else {
-            return Ok(Err("it does not answer a read of parameter 0 (identity)".to_owned()));
+            return Ok(Err("the cell does not answer a read of parameter 0 (identity)".to_owned()));
         };
         let [low, high, _, hash, state, abilities] = identity.map(i16::cast_unsigned);
         let serial = u32::from(low) | u32::from(high) << 16;
@@ -66,7 +66,7 @@ impl Session<'_> {
                 // A cell that implements the protocol without baselines.
                 Reply::Refused(Answer::REFUSED_UNKNOWN_PARAMETER) if parameter == Parameter::Baseline => {}
                 Reply::Refused(_) | Reply::Nothing => {
-                    return Ok(Err(format!("it does not answer a read of parameter {number}")));
+                    return Ok(Err(format!("the cell does not answer a read of parameter {number}")));
                 }
             }
         }
@@ -89,9 +89,13 @@ impl Session<'_> {
         self.begin_expected_exchange();
         self.send_messages(&[Message::Resume])?;
         if saved.hash == 0 {
-            left.push("its configuration: it had none, and the one of the test cannot be erased".to_owned());
+            left.push(
+                "the cell keeps the configuration of the test: it had none before, and a configuration \
+                 cannot be erased"
+                    .to_owned(),
+            );
         } else if !self.restore_stored_parameters(saved)? {
-            left.push(format!("its configuration {:04X}", saved.hash));
+            left.push(format!("its configuration {:04X} could not be committed", saved.hash));
         }
         for parameter in VOLATILE_PARAMETERS {
             let Some(words) = saved.parameters.get(&parameter.number()) else { continue };
@@ -107,7 +111,7 @@ impl Session<'_> {
                 }
             }
             if !is_back {
-                left.push(format!("parameter {}", parameter.number()));
+                left.push(format!("parameter {} could not be written", parameter.number()));
             }
         }
         self.send_messages(&[if saved.halted { Message::Halt } else { Message::Resume }])?;

@@ -232,7 +232,7 @@ impl<'a> Session<'a> {
             if let Some(id) = self.known.violated_requirement(&stray.message) {
                 let kind = stray.message.id().kind.name();
                 self.check(id, false, || {
-                    format!("the cell must not send a {kind} packet unrequested, but one came")
+                    format!("the cell must not send a {kind} packet without a request, but it sent one")
                 });
             }
         }
@@ -297,7 +297,7 @@ impl<'a> Session<'a> {
             }
             if self.bus.now() >= give_up {
                 return Err(StopReason::Bus(format!(
-                    "{}: {last} was sent, but did not appear on the bus",
+                    "{}: frame {last} was sent, but did not appear on the bus",
                     self.name
                 )));
             }
@@ -376,7 +376,10 @@ impl<'a> Session<'a> {
             }
             let torn = self.clock.torn;
             self.check("SEND-1", torn <= MAX_TORN_PACKETS, || {
-                format!("segments of a packet must follow each other in time, but one came too late in {torn} packets")
+                format!(
+                    "the segments of a packet must follow each other without long pauses, but {torn} packets \
+                     had a late segment"
+                )
             });
         }
         Ok(())

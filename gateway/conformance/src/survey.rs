@@ -114,22 +114,23 @@ impl Survey {
     ) -> Result<Format, String> {
         if let Some(frame) = &self.gateway {
             return Err(format!(
-                "a gateway is on {name} ({frame}): stop it, because the test needs the cell for itself"
+                "a gateway sends on {name} (frame {frame}): stop it, because the test needs the cell for \
+                 itself"
             ));
         }
         let others: Vec<_> =
             self.cells.keys().filter(|other| **other != cell).map(ToString::to_string).collect();
         let Some(present) = self.cells.get(&cell) else {
             if let Some(damaged) = self.damaged.get(&cell) {
-                return Err(format!("cell {cell} on {name} fails SEND-1: {damaged}"));
+                return Err(format!("cell {cell} on {name} fails requirement SEND-1: {damaged}"));
             }
             let there = if others.is_empty() {
-                "nor does any other cell".to_owned()
+                "and no other cell sends there".to_owned()
             } else {
-                format!("unlike {}", others.join(", "))
+                format!("but these cells do: {}", others.join(", "))
             };
             return Err(format!(
-                "cell {cell} sends nothing on {name}, {there}: switch it on, or give its actual node id"
+                "cell {cell} sends nothing on {name}, {there}; switch the cell on, or give its actual node id"
             ));
         };
         if present.serials.len() > 1 {
@@ -142,8 +143,8 @@ impl Survey {
         }
         if !others.is_empty() && !tolerated {
             return Err(format!(
-                "other cells are on {name}: {}; joints and halts of the test reach them too: remove them, or use \
-                 --others-will-stop",
+                "other cells are on {name}: {}; the test would send joints and halts to them too: disconnect \
+                 them, or use --others-will-stop",
                 others.join(", ")
             ));
         }
@@ -171,7 +172,7 @@ impl DamagedFrames {
             Format::Classic => {
                 let mut swapped = pairs.iter().map(|(one, other)| bytes(&[other, one]));
                 if swapped.any(|bytes| Packet::decode(self.id, &bytes).is_ok()) {
-                    return Some("its segments come in the wrong order");
+                    return Some("the cell sends the segments in the wrong order");
                 }
                 pairs.iter().map(|(one, other)| bytes(&[one, other])).collect()
             }
@@ -181,9 +182,9 @@ impl DamagedFrames {
             let (body, crc) = bytes.split_last_chunk()?;
             let of = |id: &[u8]| packet::crc16(&[id, body].concat());
             let mistakes = [
-                (of(&low_first).swap_bytes(), "its CRC has the high byte first"),
-                (of(&[]), "its CRC leaves out the identifier"),
-                (of(&high_first), "its CRC has the identifier with the high byte first"),
+                (of(&low_first).swap_bytes(), "the cell sends the CRC with the high byte first"),
+                (of(&[]), "the cell computes the CRC without the identifier"),
+                (of(&high_first), "the cell computes the CRC with the high byte of the identifier first"),
             ];
             let is_so = |(crc_of_it, _): &(u16, _)| *crc_of_it == u16::from_le_bytes(*crc);
             mistakes.into_iter().find(is_so).map(|(_, mistake)| mistake)
@@ -194,7 +195,7 @@ impl DamagedFrames {
 impl core::fmt::Display for DamagedFrames {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         let frames: Vec<_> = self.frames.iter().map(ToString::to_string).collect();
-        let fault = self.fault.as_deref().unwrap_or("no other segment came");
+        let fault = self.fault.as_deref().unwrap_or("the other segments of the packet are missing");
         write!(
             f,
             "none of {} frames is a valid packet, for example {}: {fault}",
@@ -204,6 +205,6 @@ impl core::fmt::Display for DamagedFrames {
         if let Some(mistake) = self.likely_mistake() {
             write!(f, "; {mistake}")?;
         }
-        f.write_str("; docs/reference/protocol.md has the layout and examples")
+        f.write_str("; docs/reference/protocol.md describes the layout, with examples")
     }
 }

@@ -46,15 +46,16 @@ impl Session<'_> {
             let Some(times) = self.timings.0.get(name).copied() else { continue };
             let AnswerTimeCounts { in_time, late, blameless, longest } = times;
             if in_time + late == 0 {
-                self.findings.mark_not_tested("TIME-2", format!("{name}: the bench was late each time"));
+                self.findings
+                    .mark_not_tested("TIME-2", format!("{name}: this computer was late in every attempt"));
                 continue;
             }
             let is_so = times.are_in_time();
             self.begin_expected_exchange();
             self.check("TIME-2", is_so, || {
                 format!(
-                    "{name}: {late} of {} answers came after more than {limit} ms, up to {:.1} ms ({blameless} more \
-                     while the bench was late)",
+                    "{name}: {late} of {} answers took more than {limit} ms, up to {:.1} ms ({blameless} \
+                     more late answers do not count, because this computer was late)",
                     in_time + late,
                     longest.seconds() * 1e3
                 )

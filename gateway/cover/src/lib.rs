@@ -182,16 +182,18 @@ pub struct Cover {
 #[non_exhaustive]
 pub enum CoverError {
     /// The pitch is out of range.
-    #[error("pitch {0} m: it is {MIN_PITCH} to {MAX_PITCH} m; correct it")]
+    #[error("pitch {0} m: it must be {MIN_PITCH} to {MAX_PITCH} m")]
     Pitch(f64),
     /// The clearance is out of range.
-    #[error("clearance {0} m: it is 0 to {MAX_PITCH} m; correct it")]
+    #[error("clearance {0} m: it must be 0 to {MAX_PITCH} m")]
     Clearance(f64),
     /// The number of nodes per bus is out of range.
-    #[error("{0} nodes per bus: it is 1 to {MAX_CELLS_PER_BUS}; correct it")]
+    #[error("{0} nodes per bus: the number must be 1 to {MAX_CELLS_PER_BUS}")]
     Nodes(usize),
     /// There are more links than [`MAX_LINKS`].
-    #[error("{0} links, at most {MAX_LINKS}: add those far from the skin to --leave-out")]
+    #[error(
+        "{0} links are too many, the maximum is {MAX_LINKS}: name links far from the skin in --leave-out"
+    )]
     Links(usize),
     /// A keep-out box has no link or invalid sides.
     #[error("keep-out box {index}: {reason}; correct it")]
@@ -203,7 +205,7 @@ pub enum CoverError {
     },
     /// A coordinate is infinite or NaN after the scale and the pose are applied.
     #[error(
-        "link {link}, part {part}: coordinates are not finite after scale {scale:?} and its pose; correct them"
+        "link {link}, part {part}: scale {scale:?} and the pose give coordinates that are not finite; correct them"
     )]
     NotFinite {
         /// The name of the link.
@@ -214,7 +216,10 @@ pub enum CoverError {
         scale: [f64; 3],
     },
     /// The parts of a link have more triangles in total than a single mesh may have.
-    #[error("link {link}: its parts have {count} triangles, at most {}; decimate them", mesh::MAX_TRIANGLES)]
+    #[error(
+        "link {link}: its meshes have {count} triangles, and the maximum is {}; decimate the meshes",
+        mesh::MAX_TRIANGLES
+    )]
     Triangles {
         /// The name of the link.
         link: String,
@@ -223,8 +228,8 @@ pub enum CoverError {
     },
     /// The surface of a link is too large for the pitch.
     #[error(
-        "link {link}: {area:.3e} m² of triangles would take {cells:.0} cells at a pitch of {pitch} m, at most {most}; \
-         correct the mesh's scale{}",
+        "link {link}: {area:.3e} m² of triangles need {cells:.0} cells at a pitch of {pitch} m, and the maximum is \
+         {most}; correct the mesh's scale{}",
         raised(*.pitch, *.cells, *.most)
     )]
     TooLarge {
@@ -283,11 +288,14 @@ fn check(links: &[RobotLink], others: &[RobotLink], options: &CoverOptions) -> R
     for (index, keep_out) in options.keep_out.iter().enumerate() {
         let wrong = |reason| Err(CoverError::KeepOut { index, reason });
         if keep_out.link >= links.len() {
-            return wrong(format!("link {} is none of the {} covered ones", keep_out.link, links.len()));
+            return wrong(format!("link {} is not one of the {} covered links", keep_out.link, links.len()));
         }
         for (min, max) in keep_out.min.iter().zip(&keep_out.max) {
             if !min.is_finite() || !max.is_finite() || min > max {
-                return wrong(format!("its sides go from {:?} to {:?} m", keep_out.min, keep_out.max));
+                let (min, max) = (keep_out.min, keep_out.max);
+                return wrong(format!(
+                    "the minimum {min:?} m must be finite and at most the maximum {max:?} m"
+                ));
             }
         }
     }

@@ -305,7 +305,7 @@ fn keep_out_boxes_hold_no_cell() {
     let other = CoverOptions { keep_out: vec![KeepOut { link: 1, ..keep_out }], ..all };
     assert_eq!(
         cover(&[single(cube(0.2))], &[], &other).unwrap_err().to_string(),
-        "keep-out box 0: link 1 is none of the 1 covered ones; correct it"
+        "keep-out box 0: link 1 is not one of the 1 covered links; correct it"
     );
 }
 
@@ -345,19 +345,19 @@ fn what_cannot_be_covered_is_refused_in_one_line() {
         message
     };
     let large = refused(single(cube(1000.0)), options());
-    assert!(large.starts_with("link single: 6.000e6 m² of triangles would take 4330127019 cells"), "{large}");
-    assert!(large.ends_with("at most 6000; correct the mesh's scale"), "{large}");
+    assert!(large.starts_with("link single: 6.000e6 m² of triangles need 4330127019 cells"), "{large}");
+    assert!(large.ends_with("the maximum is 6000; correct the mesh's scale"), "{large}");
     let wide = refused(single(cube(2.0)), options());
     let (_, hint) = wide.rsplit_once("or raise the pitch to ").unwrap();
     let pitch = hint.strip_suffix(" m").unwrap().parse().unwrap();
     let raised = CoverOptions { pitch, ..options() };
     assert!(Surface::new(0, &[single(cube(2.0))], &[], &raised).is_ok(), "{wide}");
     let infinite = link("l", vec![LinkMesh { scale: [1.0, f64::INFINITY, 1.0], ..LinkMesh::new(cube(1.0)) }]);
-    assert!(refused(infinite, options()).starts_with("link l, part 0: coordinates are not finite"));
+    assert!(refused(infinite, options()).starts_with("link l, part 0: scale "));
     let overflowing = link("l", vec![LinkMesh { scale: [1e200; 3], ..LinkMesh::new(cube(1.0)) }]);
     assert!(refused(overflowing, options()).starts_with("link l: inf m²"));
     let pitch = refused(single(cube(1.0)), CoverOptions { pitch: 0.0, ..options() });
-    assert_eq!(pitch, "pitch 0 m: it is 0.001 to 1 m; correct it");
+    assert_eq!(pitch, "pitch 0 m: it must be 0.001 to 1 m");
     assert!(
         refused(single(cube(1.0)), CoverOptions { pitch: f64::NAN, ..options() }).starts_with("pitch NaN m")
     );

@@ -73,19 +73,20 @@ pub fn sine_section() -> Section {
     let max = |what: &str, error: &SineError, bar: f64| Finding::new_unrated(what, error.max).at_most(bar);
     Section::new("sine", "The sine in 16 bits")
         .with_paragraph(
-            "The difference to the sine in double precision, over all 65 536 angles of a word. Of the \
-             polynomial of fifth order the paper gives a mean error; the one of seventh order is what cells compute with, and \
-             costs one multiplication more. Below it is what rounding to Q1.14 alone costs.",
+            "The figures show the difference from the sine in double precision, over all 65 536 angles of a 16-bit \
+             word. The paper gives a mean error for the polynomial of fifth order. Cells use the polynomial of \
+             seventh order, which needs one more multiplication. The lowest curve is the error of rounding to Q1.14 \
+             alone.",
         )
         .with_figures([
-            figure("sine-fifth", "Fifth order, the paper's (Eq. 17)", "error").draw_series(
+            figure("sine-fifth", "Error of the paper's fifth-order polynomial (Eq. 17)", "error").draw_series(
                 "fifth order",
                 SeriesShape::Line,
                 fifth.points.clone(),
             ),
-            figure("sine-max", "The maximum errors in 256 parts of the circle", "maximum error")
+            figure("sine-max", "Maximum error in each of 256 parts of the circle", "maximum error")
                 .draw_series("fifth order", SeriesShape::Steps, fifth.parts.clone())
-                .draw_series("seventh order, the cells'", SeriesShape::Steps, seventh.parts.clone())
+                .draw_series("seventh order, used by the cells", SeriesShape::Steps, seventh.parts.clone())
                 .draw_series("rounding alone", SeriesShape::Steps, rounded.parts.clone()),
         ])
         .with_findings([
@@ -165,7 +166,7 @@ pub fn kernels_section(robot: &str, costs: &JacobianCosts) -> Section {
     let projection = last(&costs.projection).into_iter().zip(paper::JACOBIAN_OPERATIONS);
     let figure = Figure::new(
         "kernels",
-        "Multiplications and additions over the link that the cell is on",
+        "Number of multiplications and additions, by the link that carries the cell",
         Axis::new("link", "").with_ends(0.0, 7.0),
         Axis::new("multiplications and additions", ""),
     );
@@ -176,10 +177,11 @@ pub fn kernels_section(robot: &str, costs: &JacobianCosts) -> Section {
             [kernel.to_owned(), link.to_string()].into_iter().chain(counts).collect::<Vec<_>>()
         })
     });
-    Section::new("kernels", "Operations of one cell's Jacobian")
+    Section::new("kernels", "Operations to compute the Jacobian of one cell")
         .with_paragraph(format!(
-            "Counted by running the cells' code with numbers that count their operations, on a {robot}. The wrench kernel \
-             transforms the contact's force and moment down to the base; the paper transforms frames up to the cell.",
+            "The operations were counted by running the cells' code with a number type that counts them, on a \
+             {robot}. The wrench kernel transforms the force and the moment of the contact to the base; the paper's \
+             kernel transforms frames from the base to the cell.",
         ))
         .with_figures([figure
             .draw_series("wrench", SeriesShape::Line, products(&costs.wrench))

@@ -136,13 +136,14 @@ fn coefficient_findings(what: &str, ours: impl Into<Quantity>, paper_s: f64) -> 
     let ratio = ours.value / (paper_s * 1e9);
     [
         Finding::less_is_better(what, paper_s * 1e9, ours),
-        Finding::new_unrated(format!("{what}: ratio of ours to the paper's"), ratio),
+        Finding::new_unrated(format!("{what}: ratio of our value to the paper's"), ratio),
     ]
 }
 
 /// Compares the maximum number of cells for which one cycle is long enough with that in the paper.
 fn cell_limit_finding(active: &str, paper: f64, ours: f64) -> Finding {
-    let what = format!("most cells at 500 Hz, {active} active, with 0.2 ms for the rest of a cycle");
+    let what =
+        format!("maximum number of cells at 500 Hz, {active} active, if the rest of a cycle takes 0.2 ms");
     Finding::more_is_better(what, paper, (ours, "cells"))
 }
 
@@ -161,7 +162,7 @@ fn logarithmic_figure(
     law: impl Fn(f64) -> f64,
 ) -> Figure {
     let law = (0..=100).map(|step| most * f64::from(step) / 100.0).map(|x| (x, law(x) * 1e6));
-    let title = format!("The same, compared with the paper's law ({equation})");
+    let title = format!("The same measurements, compared with the paper's law ({equation})");
     let y = Axis::new("T_skin", "µs").with_log_scale().with_ends(0.1, 10_000.0);
     Figure::new(format!("{}-paper", figure.name), title, figure.x.clone(), y)
         .draw_series("measured", SeriesShape::Points, measured)
@@ -183,7 +184,7 @@ pub fn fig9_section(over: &CentralTimesByCells) -> Section {
     };
     let band = micros(|point| point[2]).into_iter().chain(micros(|point| point[3]).into_iter().rev());
     let median = micros(|point| point[1]);
-    let fig9 = empty_time_figure("fig9", "T_skin over cells, none active", "cells, none active")
+    let fig9 = empty_time_figure("fig9", "T_skin by number of cells, none active", "cells, none active")
         .draw_series("middle half", SeriesShape::Band, band.collect())
         .draw_series("median", SeriesShape::Points, median.clone())
         .draw_series("linear fit", SeriesShape::Line, line_end_points(line, most));
@@ -191,11 +192,12 @@ pub fn fig9_section(over: &CentralTimesByCells) -> Section {
         paper::CENTRAL_TIME_PER_CELL_S * cells + paper::CENTRAL_FIXED_TIME_S
     });
     let cells = paper::max_cells(line.slope * 1e-9, line.intercept * 1e-9, 0.0, 0.0);
-    Section::new("fig9", "Fig. 9: central computation over the number of cells")
+    Section::new("fig9", "Fig. 9: time of the central computation by number of cells")
         .with_paragraph(
-            "A loop that computes the skin's torques has to look at every cell in every cycle, also when none is \
-             touched. Timed is the gateway's own central computation, the code that a comparing tick runs; the medians of \
-             many rounds in random order, with the middle half of the measurements as a band.",
+            "A loop that computes the skin's torques has to process every cell in every cycle, even if no cell is \
+             touched. The timed code is the gateway's central computation, which also runs in ticks that compare \
+             torques. The figure shows the medians of many rounds in random order; the band is the middle half of \
+             the measurements.",
         )
         .with_paragraph(format!(
             "T_skin(N) = {} ns · N + {} ns, R² = {:.4}. The paper's law is 827 ns · N + 10730 ns, on another \
@@ -206,12 +208,12 @@ pub fn fig9_section(over: &CentralTimesByCells) -> Section {
             line.quality
         ))
         .with_paragraph(format!(
-            "By the paper's reasoning, (2 ms - 0.2 ms - start) / slope, this computer could handle {cells} cells; the paper's law \
-             gives 2163, which the paper rounds to 2160.",
+            "By the paper's reasoning, (2 ms - 0.2 ms - intercept) / slope, this computer could handle {cells} \
+             cells; the paper's law gives 2163, which the paper rounds to 2160.",
         ))
         .with_figures([fig9, papers])
         .with_findings(coefficient_findings("T_skin for each cell (slope of Eq. 29)", line.slope_in("ns"), paper::CENTRAL_TIME_PER_CELL_S))
-        .with_findings(coefficient_findings("T_skin without a cell", (line.intercept, "ns"), paper::CENTRAL_FIXED_TIME_S))
+        .with_findings(coefficient_findings("T_skin without cells", (line.intercept, "ns"), paper::CENTRAL_FIXED_TIME_S))
         .with_findings([fit_quality_finding(line, paper::CELLS_FIT_R_SQUARED), cell_limit_finding("none", paper::MAX_CELLS_NONE_ACTIVE, cells)])
 }
 
@@ -232,7 +234,7 @@ pub fn fig10_section(over: &CentralTimesByActiveCells, cells: &CentralTimesByCel
     let micros: Vec<_> = points.iter().map(|point| (point.x, point.y * 1e-3)).collect();
     let fig10 = empty_time_figure(
         "fig10",
-        format!("T_skin over the number of active cells, of {of}"),
+        format!("T_skin by number of active cells, of {of} cells"),
         "active cells",
     )
     .draw_series("median of touches", SeriesShape::Points, micros.clone())
@@ -258,10 +260,10 @@ pub fn fig10_section(over: &CentralTimesByActiveCells, cells: &CentralTimesByCel
         let [slope, start, papers] = [line.slope, line.intercept, paper * 1e9].map(format_number);
         [name.to_owned(), slope, start, quality, papers]
     });
-    Section::new("fig10", "Fig. 10: central computation over the number of active cells")
+    Section::new("fig10", "Fig. 10: time of the central computation by number of active cells")
         .with_paragraph(format!(
-            "{of} cells, {touches} touches, each on a patch of cells of random size at a random place; the line is \
-             weighted by the number of touches, as the paper's is by the number of samples."
+            "The skin has {of} cells. Each of the {touches} touches is on a patch of random size at a random place. \
+             The line is weighted by the number of touches; the paper's line is weighted by the number of samples."
         ))
         .with_paragraph(format!(
             "T_skin(N_act, N) = {} ns · N_act + {} ns · N + {} ns (Eq. 31; the paper: 798, 827 and 10730 ns).",
@@ -278,7 +280,7 @@ pub fn fig10_section(over: &CentralTimesByActiveCells, cells: &CentralTimesByCel
         ))
         .with_findings([fit_quality_finding(line, paper::ACTIVE_CELLS_FIT_R_SQUARED), all.with_paper_value(all_papers)])
         .with_findings(limits)
-        .with_tables([Table::new("Laws", ["law", "each, ns", "start, ns", "R²", "the paper's each, ns"], laws)])
+        .with_tables([Table::new("Laws", ["law", "slope, ns", "intercept, ns", "R²", "slope in the paper, ns"], laws)])
 }
 
 #[cfg(test)]
@@ -303,10 +305,11 @@ mod tests {
         let active = CentralTimesByActiveCells { cells: 253, points: points.to_vec(), line: over };
         let (nine, ten) = (fig9_section(&cells), fig10_section(&active, &cells));
         let all = || nine.findings.iter().chain(&ten.findings);
-        for finding in all().filter(|finding| finding.what.ends_with("ratio of ours to the paper's")) {
+        for finding in all().filter(|finding| finding.what.ends_with("ratio of our value to the paper's")) {
             assert!((finding.ours.value - 1.0).abs() < 1e-9, "{finding:?}");
         }
-        let limits: Vec<_> = all().filter(|finding| finding.what.starts_with("most cells")).collect();
+        let limits: Vec<_> =
+            all().filter(|finding| finding.what.starts_with("maximum number of cells")).collect();
         assert_eq!(
             limits.iter().map(|limit| limit.ours.value.to_string()).collect::<Vec<_>>(),
             ["2163", "2163", "2067"]

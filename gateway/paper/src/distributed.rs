@@ -220,35 +220,45 @@ pub fn distributed_section(measured: &DistributedMeasurements) -> Section {
     let findings = [
         Finding::new_unrated("distributed tick for each further bus", buses.slope_in("ns")),
         Finding::new_unrated(
-            "the same by the most cells that a bus has numbers for",
+            "the same, divided by the maximum number of cells on a bus (254)",
             (buses.slope / 254.0, "ns"),
         ),
         Finding::new_unrated(
-            "receiving a torque: checked, read and added by the receiver's thread, which no paper counts",
+            "checking, decoding and adding a received torque in the receiver thread (not counted in the paper)",
             (*receiving, "ns"),
         ),
         Finding::new_unrated(
-            "receiving an active cell's torques, by computing it centrally in the 8 ticks of an epoch",
+            "receiving the torque of an active cell, relative to computing it centrally in the 8 ticks of an epoch",
             receiving / (8.0 * active.central.slope),
         ),
     ];
-    Section::new("distributed", "The distributed way over cells and active cells")
+    Section::new("distributed", "Distributed computation by number of cells and of active cells")
         .with_paragraph(format!(
-            "Up to {of} cells on {BUSES} buses. For the distributed way the whole tick is timed: sums of all buses, controller, \
-             robot, joints; for the central way only T_skin, the part that computes torques. Both are timed in the same run, \
-             in random order. The robot does not move.",
+            "The skin has up to {of} cells on {BUSES} buses. For the distributed computation the whole tick is \
+             timed: sums of all buses, controller, robot, joints; for the central computation only T_skin, the part \
+             that computes torques. Both are timed in the same run, in random order. The robot does not move.",
         ))
         .with_paragraph(format!(
-            "A tick of the distributed way receives one sum per bus and no data of single cells, so only more buses make it \
-             longer: {} ns each, with or without cells. More cells mean more work for the receivers, which run in \
-             threads of their own: {} ns per received torque, once per epoch, and only for cells in contact. The time that the \
-             kernel needs to deliver a frame to the receiver is not included.",
+            "A tick of the distributed computation receives one sum per bus and no data of single cells, so only \
+             more buses make it longer: {} ns each, with or without cells. More cells mean more work for the \
+             receivers, which run in threads of their own: {} ns per received torque, once per epoch, and only for \
+             cells in contact. The time that the kernel needs to deliver a frame to the receiver is not included.",
             format_number(buses.slope),
             format_number(*receiving)
         ))
         .with_figures([
-            figure("distributed-cells", "Over cells, none active".to_owned(), "cells", cells),
-            figure("distributed-active", format!("Over the number of active cells, of {of}"), "active cells", active),
+            figure(
+                "distributed-cells",
+                "Time of a tick by number of cells, none active".to_owned(),
+                "cells",
+                cells,
+            ),
+            figure(
+                "distributed-active",
+                format!("Time of a tick by number of active cells, of {of} cells"),
+                "active cells",
+                active,
+            ),
         ])
         .with_findings(slope_findings("cell", cells))
         .with_findings(slope_findings("active cell", active))

@@ -93,26 +93,30 @@ impl Experiment {
             Self::Fig7 => ("fig7", "joint velocities and active cells of the moving arm", [1, 1]),
             Self::Fig8 => (
                 "fig8",
-                "cycle times of the moving arm, the central computation switched off at 5.7 s",
+                "cycle times of the moving arm; the central computation is switched off at 5.7 s",
                 [1, 1],
             ),
-            Self::Fig9 => ("fig9", "central computation over 0 to 3000 cells, none active (Eq. 29)", [1, 4]),
+            Self::Fig9 => {
+                ("fig9", "time of the central computation for 0 to 3000 cells, none active (Eq. 29)", [1, 4])
+            }
             Self::Fig10 => (
                 "fig10",
-                "central computation over active cells (Eq. 30, 31), and the most cells at 500 Hz",
+                "time of the central computation by active cells (Eq. 30, 31), maximum number of cells at 500 Hz",
                 [1, 4],
             ),
             Self::Distributed => (
                 "distributed",
-                "the loop's ticks over cells and active cells, and the cost of receiving",
+                "time of the loop's ticks by number of cells and of active cells, and of receiving torques",
                 [1, 20],
             ),
             Self::Sums => {
-                ("sums", "error of summed torques over active cells: cut off, rounded, carried", [1, 10])
+                ("sums", "error of summed torques by active cells: truncated, rounded, carried", [1, 10])
             }
-            Self::Sine => ("sine", "error of the 16-bit sines over the whole circle", [1, 1]),
-            Self::Kernels => ("kernels", "operations of one cell's Jacobian, by both kernels", [1, 1]),
-            Self::Load => ("load", "bus load over cells for common bit rates", [1, 1]),
+            Self::Sine => ("sine", "error of the 16-bit sine functions over the whole circle", [1, 1]),
+            Self::Kernels => {
+                ("kernels", "operations to compute the Jacobian of one cell, with both kernels", [1, 1])
+            }
+            Self::Load => ("load", "bus load by number of cells, for common bit rates", [1, 1]),
             Self::Scale => (
                 "scale",
                 "whole benches of 253 to 10 000 cells: start, processor, memory, ticks, lateness, replies in time",
@@ -158,7 +162,7 @@ impl FromStr for Experiment {
         let found = Self::ALL.into_iter().find(|experiment| experiment.name() == name);
         found.ok_or_else(|| {
             let names: Vec<_> = Self::ALL.iter().map(|experiment| experiment.name()).collect();
-            format!("there is no experiment of this name: choose all, {}", names.join(", "))
+            format!("there is no experiment of this name: use all, {}", names.join(", "))
         })
     }
 }

@@ -31,25 +31,27 @@ pub fn load_section() -> Section {
     };
     let figure = Figure::new(
         "load",
-        "Load of one bus, every cell in contact, worst case",
+        "Load of one bus in the worst case, with every cell in contact",
         Axis::new("cells", "").with_ends(0.0, f64::from(MAX_CELLS)),
         Axis::new("load", "%").with_ends(0.0, 200.0),
     );
     let marks = [
         MarkLine::at_y(100.0, "full"),
-        MarkLine::at_x(f64::from(MAX_NODES_PER_BUS - 1), "nodes electrically"),
+        MarkLine::at_x(f64::from(MAX_NODES_PER_BUS - 1), "maximum number of nodes"),
         MarkLine::at_x(count_to_f64(cells), "the paper's arm"),
     ];
-    Section::new("load", "Bus load over the number of cells")
+    Section::new("load", "Bus load by number of cells")
         .with_paragraph(
-            "What joints, replies and heartbeats need of a bus when every cell is in contact: 62.5 epochs and 4 heartbeats of \
-             each cell a second, 16 bytes in a packet, 11-bit identifiers, and as many stuff bits as a frame can have. Above \
-             100 % it does not fit, whatever the order. Sums along the tree need as many frames on one shared bus. These are the \
-             numbers of skinbus fit, which shows more about one skin.",
+            "The load is the share of time that joints, replies and heartbeats occupy a bus when every cell is in \
+             contact: with 62.5 epochs and 4 heartbeats of each cell a second, 16 bytes in a packet, 11-bit \
+             identifiers, and as many stuff bits as a frame can have. A load above 100 % is not possible. Sums along \
+             the tree need as many frames on one shared bus. These are the numbers of `skinbus fit`, which shows \
+             more about one skin.",
         )
         .with_paragraph(format!(
-            "The paper considers time only. Transceivers can drive about {MAX_NODES_PER_BUS} nodes, one of which is the gateway: so the table has \
-             the number of buses that {cells} cells need for time alone, and the number for all limits, with the limit that decides."
+            "The paper considers time only. Transceivers can drive about {MAX_NODES_PER_BUS} nodes, one of which is \
+             the gateway. So the table has the number of buses that {cells} cells need for time alone, and the \
+             number for all limits, with the limit that decides."
         ))
         .with_figures([figure.with_series(rows.iter().map(series)).with_marks(marks)])
         .with_findings(rows.iter().map(finding))
@@ -75,12 +77,13 @@ fn load_table(rows: &[RatesRow], cells: usize) -> Table {
         "packet, µs",
         "joints and replies, %",
         "with heartbeats, %",
-        "cells a bus",
-        "buses by time",
+        "cells per bus",
+        "buses for time alone",
         "buses needed",
     ];
     let title = format!(
-        "Worst case: load of one bus with {cells} cells, maximum cells per bus in time, and buses needed for {cells} cells"
+        "Worst case: load of one bus with {cells} cells, maximum cells per bus in time, and buses needed for {cells} \
+         cells"
     );
     Table::new(title, head, rows.iter().map(row))
 }
@@ -97,13 +100,13 @@ mod tests {
         assert_eq!(
             named,
             [
-                (("classic 500k", "10"), "10 time"),
-                (("classic 1M", "5"), "5 time"),
-                (("500k/2M", "3"), "3 time, nodes"),
-                (("500k/5M", "2"), "3 nodes"),
-                (("1M/2M", "3"), "3 time, nodes"),
-                (("1M/5M", "2"), "3 nodes"),
-                (("1M/8M", "1"), "3 nodes"),
+                (("classic 500k", "10"), "10 (time)"),
+                (("classic 1M", "5"), "5 (time)"),
+                (("500k/2M", "3"), "3 (time, nodes)"),
+                (("500k/5M", "2"), "3 (nodes)"),
+                (("1M/2M", "3"), "3 (time, nodes)"),
+                (("1M/5M", "2"), "3 (nodes)"),
+                (("1M/8M", "1"), "3 (nodes)"),
             ]
         );
         assert!(section.findings.iter().all(|finding| finding.bar.is_none()), "{:?}", section.findings);
@@ -112,7 +115,7 @@ mod tests {
             (what(5), what(6)),
             (
                 "worst case of one bus at 1M/5M: does not fit: bandwidth (all 253 cells answer)",
-                "worst case of one bus at 1M/8M: in time, but 254 nodes (all 253 cells answer)"
+                "worst case of one bus at 1M/8M: in time, but too many nodes: 254 (all 253 cells answer)"
             )
         );
         assert!((section.findings[5].ours.value - 118.9).abs() < 0.05);

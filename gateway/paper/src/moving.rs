@@ -102,22 +102,22 @@ pub fn fig6_section(single: &BenchRun, summed: &BenchRun) -> Section {
     );
     let rows = [
         row("single cells, Q3.12, loaded joints", single, "single"),
-        row("the same against unrounded parameters", single, "unquantised"),
-        row("the whole skin, sum of Q3.12 words", single, "whole"),
-        row("the whole skin, sums along the tree in Q7.8", summed, "sums"),
+        row("single cells, compared with unrounded parameters", single, "unquantised"),
+        row("whole skin, sum of Q3.12 words", single, "whole"),
+        row("whole skin, sums along the tree in Q7.8", summed, "sums"),
     ];
     Section::new("fig6", title)
         .with_paragraph(format!(
-            "{} cells, each a process on a bus, answer joints at 62.5 Hz while the arm yields to touches; until {:.1} s \
-             the loop also computes the torques itself.",
+            "{} cells, each a process on a bus, answer joints messages at 62.5 Hz while the arm yields to touches; \
+             until {:.1} s the loop also computes the torques itself.",
             single.cells(),
             single.switch_off_time_s().unwrap_or(f64::NAN)
         ))
         .with_paragraph(
-            "Errors compare each answer with the central computation on the same joints and touches, over the joints that \
-             the cell loads, so they hold nothing of what was on its way; the curves are what the loop had at each tick. \
-             The run with sums is a second one, with the same touches; only epochs whose sums were complete in time are \
-             compared.",
+            "The errors compare each reply with the central computation for the same joint positions and touches, on \
+             the joints that the cell loads, so they contain no effect of delays; the curves show the torques that \
+             the loop had at each tick. The run with sums is a second run with the same touches; only epochs whose \
+             sums were complete in time are compared.",
         )
         .with_paragraph(joints_without_torque(single))
         .with_figures((0..single.joints).map(joint))
@@ -125,11 +125,11 @@ pub fn fig6_section(single: &BenchRun, summed: &BenchRun) -> Section {
             cell.with_requirement("at most 1.2e-4 Nm", mean_single <= 1.2e-4),
             sum,
             single.replies_finding(),
-            Finding::new_unrated(format!("cells' torques that arrived in sums in time, of {summed_due} due"), summed_in),
+            Finding::new_unrated(format!("contributions to sums in time, of {summed_due} due"), summed_in),
         ])
         .with_tables([Table::new(
-            "Errors against the central computation, Nm",
-            ["what", "mean", "max", "torques"],
+            "Errors relative to the central computation, Nm",
+            ["comparison", "mean", "maximum", "torques"],
             rows,
         )])
 }
@@ -140,9 +140,9 @@ fn joints_without_torque(run: &BenchRun) -> String {
     let bare: Vec<_> =
         (0..run.joints).filter(|&joint| !bears(joint)).map(|joint| (joint + 1).to_string()).collect();
     if bare.is_empty() {
-        "Every joint has a torque.".to_owned()
+        "Cells load every joint.".to_owned()
     } else {
-        format!("No torque on joints {}, because no cell is mounted beyond them.", bare.join(", "))
+        format!("There is no torque on joints {}, because no cell is mounted beyond them.", bare.join(", "))
     }
 }
 
@@ -160,16 +160,16 @@ pub fn fig7_section(run: &BenchRun) -> Section {
     let active = run.rows.iter().map(|row| row.contributing).max().unwrap_or(0);
     let fastest = run.rows.iter().flat_map(|row| row.velocity).map(f64::abs).fold(0.0, f64::max);
     let velocities = run.time_figure("fig7-velocities", "Joint velocities", Axis::new("velocity", "rad/s"));
-    let cells = run.time_figure("fig7-active", "Active cells", Axis::new("cells in the torque", ""));
+    let cells = run.time_figure("fig7-active", "Active cells", Axis::new("cells that contribute", ""));
     let contributing = run.points_over_time(|row| f64::from(row.contributing));
     Section::new("fig7", "Fig. 7: joint velocities and active cells")
-        .with_paragraph("The same run. The cells' torques move the arm: the loop uses only theirs.")
+        .with_paragraph("This is the same run. The cells' torques move the arm; the loop uses no others.")
         .with_figures([
             velocities.with_series((0..run.joints).map(velocity)),
             cells.draw_series("active cells", SeriesShape::Steps, contributing),
         ])
         .with_findings([
-            Finding::new_unrated("most cells active at once", (f64::from(active), "cells")),
+            Finding::new_unrated("maximum number of cells active at once", (f64::from(active), "cells")),
             Finding::new_unrated("maximum joint velocity", (fastest, "rad/s")),
         ])
 }
@@ -232,19 +232,20 @@ pub fn fig8_section(run: &BenchRun) -> Section {
     let central = |row: &TickRow| row.central_us;
     Section::new("fig8", format!("Fig. 8: cycle times, {cells} cells"))
         .with_paragraph(
-            "T_total is how long a tick took from reading the sums to handing on its record, T_skin the central computation in \
-             it. Unlike the paper's, T_total does not hold the robot's own driver: the robot is simulated.",
+            "T_total is the time of a tick from reading the sums to passing on its record, and T_skin is the time of \
+             the central computation in it. Unlike in the paper, T_total does not include the driver of the robot, \
+             because the robot is simulated.",
         )
         .with_paragraph(format!(
-            "The axis ends at twice the 99th percentile; {beyond} of {} ticks, during which the machine was busy with other work, lie \
-             beyond it, but are in the data.",
+            "The axis ends at twice the 99th percentile. {beyond} of {} ticks, during which the machine was busy \
+             with other work, are beyond its end, but are in the data.",
             run.rows.len()
         ))
         .with_figures([
             figure("fig8", "Cycle times", top)
                 .draw_series("T_total", SeriesShape::Line, run.points_over_time(took))
                 .draw_series("T_skin", SeriesShape::Line, run.points_over_time(central)),
-            figure("fig8-medians", "The same, medians of 25 cycles", top / 2.0)
+            figure("fig8-medians", "Cycle times, medians of 25 cycles", top / 2.0)
                 .draw_series("T_total", SeriesShape::Steps, medians(&took))
                 .draw_series("T_skin", SeriesShape::Steps, medians(&central)),
         ])
@@ -258,7 +259,7 @@ pub fn fig8_section(run: &BenchRun) -> Section {
         .with_findings([
             Finding::new_unrated("ticks above 2 ms", count_to_f64(over)),
             Finding::new_unrated(
-                "all of the gateway's processor time by frames that came: socket, loop, recorder",
+                "processor time of the gateway for each received frame: socket, loop, recorder",
                 us(per_frame),
             ),
         ])
@@ -317,7 +318,7 @@ mod tests {
         assert!((of("T_total before").ours.value - 4.0).abs() < 1e-9);
         assert!((of("T_total after the switch, median").ours.value - 1.0).abs() < 1e-9);
         assert!(section.findings.iter().all(|finding| finding.verdict != FindingVerdict::Worse));
-        assert!((of("all of the gateway's").ours.value - 10.0).abs() < 1e-9);
+        assert!((of("processor time of the gateway").ours.value - 10.0).abs() < 1e-9);
         let mut never_off = run;
         never_off.rows.iter_mut().for_each(|row| row.central_us = 3.0);
         assert!(

@@ -146,7 +146,7 @@ type SumMethod = (&'static str, &'static str, fn(&SumErrors) -> f64);
 
 /// All kinds of sums that are compared.
 const SUM_METHODS: [SumMethod; 5] = [
-    ("truncated", "each cut off, mean error", |at| at.truncated),
+    ("truncated", "truncated, mean error", |at| at.truncated),
     ("rounded", "rounded, mean error", |at| at.rounded),
     ("carried", "carried, mean error of single epochs", |at| at.carried),
     ("rounded, average of 32", "rounded, mean error of the average over 32 epochs", |at| at.rounded_average),
@@ -160,7 +160,7 @@ pub fn sums_section(skin: &Skin, errors: &[SumErrors]) -> Section {
     let figure = Figure::new(
         "sums",
         format!(
-            "Mean error of the summed torque over the number of active cells, of {of}, Q7.8, loaded joints"
+            "Mean error of the summed torque by number of active cells, of {of} cells, Q7.8, loaded joints"
         ),
         Axis::new("active cells", "").with_log_scale().with_ends(0.9, 300.0),
         Axis::new("mean absolute error", "Nm").with_log_scale().with_ends(1e-5, 1.0),
@@ -182,12 +182,13 @@ pub fn sums_section(skin: &Skin, errors: &[SumErrors]) -> Section {
         core::iter::once(at.active.to_string()).chain(errors).collect::<Vec<_>>()
     });
     let [a, b, c, d, e] = SUM_METHODS.map(|(caption, ..)| caption);
-    Section::new("sums", "Sums along the tree: cutting off, rounding, carrying")
+    Section::new("sums", "Sums along the tree: truncating, rounding, carrying")
         .with_paragraph(
             "Random cells measure 0.6 to 6 N while the arm moves; every cell computes and adds with the code of its \
-             microcontroller. A cell that cuts off what Q7.8 has no room for errs by half a step of 0.0039 Nm to the same \
-             side as all others, so errors add up with the number of cells; rounded ones grow with its root. A cell that \
-             carries what rounding took away into its next value errs more in one epoch and not at all in the long run.",
+             microcontroller. Truncation to Q7.8 makes the torque of every cell too low by half a step of 0.0039 Nm \
+             on average, so the error of the sum grows with the number of cells. With rounding it grows with the \
+             square root of that number. A cell that carries its rounding error into its next value has a larger \
+             error in single epochs, but none on average.",
         )
         .with_paragraph(format!(
             "The paper's {} Nm is the error of truncated sums with about twenty active cells.",

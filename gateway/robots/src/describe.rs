@@ -65,7 +65,8 @@ pub struct SkinImport<'a> {
 pub enum ImportError {
     /// The chains together have too many joints.
     #[error(
-        "{count} joints move between the root and the tips; a robot has 1 to {MAX_ROBOT_JOINTS}: give fewer --tip"
+        "{count} joints move between the root and the tips; a robot must have 1 to {MAX_ROBOT_JOINTS}: use fewer --tip \
+         options"
     )]
     Joints {
         /// Number of joints of all chains together.
@@ -80,7 +81,7 @@ pub enum ImportError {
         error: RobotError,
     },
     /// The normal of a cell has no direction, because its length is zero or not finite.
-    #[error("{}the normal nx,ny,nz = {x},{y},{z} has no direction: it must be longer than 0", line_prefix(*line))]
+    #[error("{}the normal nx,ny,nz = {x},{y},{z} has no direction: its length must be above 0", line_prefix(*line))]
     Normal {
         /// The line of the file of cells.
         line: usize,
@@ -136,8 +137,9 @@ pub enum ImportError {
     },
     /// A cell is too far from the joints that move it.
     #[error(
-        "{}position px,py,pz = {x},{y},{z} of link {link:?} can be up to {reach:.3} m from a frame of the rows below \
-         it, if all joints turn freely; less than {MAX_REACH} m is possible: correct it, or choose a root nearer to the link",
+        "{}position px,py,pz = {x},{y},{z} of link {link:?} can be up to {reach:.3} m from the frame of a \
+         preceding row, if all joints turn freely; it must be less than {MAX_REACH} m: correct the position, or \
+         choose a root nearer to the link",
         line_prefix(*line)
     )]
     Reach {

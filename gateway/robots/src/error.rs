@@ -79,7 +79,7 @@ pub enum RobotProblem {
         allowed: String,
     },
     /// Two links or two joints have the same name.
-    #[error("two {what}s are named {name:?}; each needs a name of its own: rename one")]
+    #[error("two {what}s are named {name:?}; each needs a unique name: rename one")]
     Duplicate {
         /// Kind of the two elements: `link` or `joint`.
         what: &'static str,
@@ -87,7 +87,7 @@ pub enum RobotProblem {
         name: String,
     },
     /// A joint names a link that does not exist.
-    #[error("joint {joint:?} has the {role} {link:?}, but there is no such link; the nearest are {nearest}")]
+    #[error("joint {joint:?} has the {role} {link:?}, but there is no such link; similar names: {nearest}")]
     JointWithoutLink {
         /// Name of the joint.
         joint: String,
@@ -100,7 +100,7 @@ pub enum RobotProblem {
     },
     /// Two joints move the same link.
     #[error(
-        "link {link:?} is the child of the joints {first:?} and {second:?}; one is allowed: remove the other"
+        "link {link:?} is the child of the joints {first:?} and {second:?}; only one is allowed: remove the other"
     )]
     TwoParents {
         /// Name of the link.
@@ -115,7 +115,7 @@ pub enum RobotProblem {
     Cycle(String),
     /// Two links have no parent, so that the links form more than one tree.
     #[error(
-        "the links {first:?} and {second:?} have no parent; one root is allowed: connect them with a fixed joint"
+        "the links {first:?} and {second:?} have no parent; only one root is allowed: connect them with a fixed joint"
     )]
     TwoRoots {
         /// Name of the first link without a parent.
@@ -124,7 +124,7 @@ pub enum RobotProblem {
         second: String,
     },
     /// The requested link does not exist.
-    #[error("there is no link {link:?}; the nearest are {nearest}")]
+    #[error("there is no link {link:?}; similar names: {nearest}")]
     NoSuchLink {
         /// The requested name.
         link: String,
@@ -132,7 +132,7 @@ pub enum RobotProblem {
         nearest: String,
     },
     /// The requested joint does not exist, or does not move by itself.
-    #[error("there is no moving joint {joint:?}; the nearest are {nearest}")]
+    #[error("there is no moving joint {joint:?}; similar names: {nearest}")]
     NoSuchJoint {
         /// The requested name.
         joint: String,
@@ -141,7 +141,8 @@ pub enum RobotProblem {
     },
     /// The rows of a chain in a skin differ from those of the same chain in the file.
     #[error(
-        "the link behind joint {joint:?} is not where chain {chain:?} of the skin has it: import the skin from this file again, or correct the rows"
+        "the URDF and chain {chain:?} of the skin place the link behind joint {joint:?} differently: import the skin \
+         from this file again, or correct the rows"
     )]
     OtherRows {
         /// Name of the first joint that differs.
@@ -161,7 +162,8 @@ pub enum RobotProblem {
     },
     /// No joint of the chain moves.
     #[error(
-        "no joint moves between {root:?} and {tip:?}; 1 to {MAX_JOINTS} are needed: choose a tip farther out, or a root nearer to the base"
+        "no joint moves between {root:?} and {tip:?}, but a chain needs 1 to {MAX_JOINTS} moving joints: choose a tip \
+         farther out, or a root nearer to the base"
     )]
     NoMovingJoint {
         /// Name of the root link.
@@ -171,7 +173,8 @@ pub enum RobotProblem {
     },
     /// The chain has too many joints.
     #[error(
-        "{count} joints move between {root:?} and {tip:?}; at most {MAX_JOINTS} are possible: choose a root or a tip nearer to the other"
+        "{count} joints move between {root:?} and {tip:?}; the maximum is {MAX_JOINTS}: choose a root and a tip that \
+         are nearer to each other"
     )]
     TooManyJoints {
         /// Number of joints of the chain.
@@ -183,7 +186,8 @@ pub enum RobotProblem {
     },
     /// The chain needs too many rows.
     #[error(
-        "the chain to {tip:?} needs {count} rows; at most {MAX_ROWS} are possible: choose a root or a tip nearer to the other"
+        "the chain to {tip:?} needs {count} rows; the maximum is {MAX_ROWS}: choose a root and a tip that are nearer \
+         to each other"
     )]
     TooManyRows {
         /// Number of rows that the chain needs.
@@ -233,7 +237,7 @@ pub enum RobotProblem {
     },
     /// A length of a row exceeds the range of a cell's parameters.
     #[error(
-        "row {row}, to {to}: {what} = {value:.3} m; [-{MAX_LENGTH_M}, {MAX_LENGTH_M}) m is possible: {hint}"
+        "row {row}, to {to}: {what} = {value:.3} m; it must be in [-{MAX_LENGTH_M}, {MAX_LENGTH_M}) m: {hint}"
     )]
     Length {
         /// Number of the row, from 1.
@@ -249,7 +253,8 @@ pub enum RobotProblem {
     },
     /// A cell on the chain can be farther from a joint than a cell can compute.
     #[error(
-        "link {link:?} can be up to {reach:.3} m from a frame of the rows below it, if all joints turn freely; less than {MAX_REACH} m is possible: choose a tip or a root nearer to the other"
+        "link {link:?} can be up to {reach:.3} m from the frame of a preceding row, if all joints turn freely; it must \
+         be less than {MAX_REACH} m: choose a root and a tip that are nearer to each other"
     )]
     Reach {
         /// Name of the link.
@@ -259,7 +264,8 @@ pub enum RobotProblem {
     },
     /// The kinematics of the rows differs from that of the URDF.
     #[error(
-        "the rows differ by {residual:.1e} m or rad from the URDF at link {link:?}; {MAX_RESIDUAL:.0e} is allowed: please report this robot"
+        "the rows differ by {residual:.1e} m or rad from the URDF at link {link:?}; at most {MAX_RESIDUAL:.0e} is \
+         allowed: please report this robot"
     )]
     Residual {
         /// Name of the link with the largest difference.

@@ -31,13 +31,13 @@ pub(super) fn calibration_page(file: &Path, skin: &Skin, calibration: &Calibrati
         let Some(details) = still.details.get_mut(index) else { continue };
         let mut detail = |name: &str, value: String| details.push((name.to_owned(), value));
         if let Some(pose) = result.found {
-            let certain = format!("within {} mm and {} degrees", pose.position_mm, pose.orientation_deg);
-            detail("Certain", certain);
+            let certain = format!("{} mm and {} degrees", pose.position_mm, pose.orientation_deg);
+            detail("Uncertainty", certain);
             if let (Some(mm), Some(degrees)) = (pose.moved_mm, pose.turned_deg) {
-                detail("From its description", format!("{mm} mm, {degrees} degrees"));
+                detail("Distance from the skin's pose", format!("{mm} mm, {degrees} degrees"));
             }
         }
-        result.troubles.iter().for_each(|trouble| detail("Not to be trusted", trouble.to_string()));
+        result.troubles.iter().for_each(|trouble| detail("Unreliable", trouble.to_string()));
     }
     still.scene.name = format!("{}, calibrated", skin.name);
     still.to_html()

@@ -8,7 +8,8 @@ use protocol::usage::Failure;
 pub(super) fn check_same_skin(name: &str, skin: &Skin, recorded: &Skin) -> Result<(), Failure> {
     let Some((what, is, was)) = recorded_skin_difference(skin, recorded) else { return Ok(()) };
     Err(Failure::usage_error(format!(
-        "{name} was recorded with another skin: {what} {is}, but {was} in the recording; calibrate with the skin that was recorded"
+        "{name} was recorded with a different skin: {what}: {is} in the given skin, but {was} in the \
+         recording; give the skin with which the recording was made"
     )))
 }
 
@@ -18,7 +19,7 @@ fn recorded_skin_difference(skin: &Skin, recorded: &Skin) -> Option<(&'static st
     let all: [(&str, SkinProperty); 6] = [
         ("buses", |skin| comma_separated_list(skin.buses.iter().map(|bus| bus.name.clone()))),
         ("joints", |skin| comma_separated_list(skin.robot.joints.iter().map(|joint| joint.name.clone()))),
-        ("cells", |skin| skin.cells.len().to_string()),
+        ("number of cells", |skin| skin.cells.len().to_string()),
         ("nodes", |skin| {
             sorted_cell_texts(skin, |skin, cell| format!("{} {}", bus(skin, cell.bus), cell.node))
         }),
@@ -56,13 +57,12 @@ fn row_difference(skin: &Skin, recorded: &Skin) -> Option<(&'static str, String,
             .collect()
     };
     let (is, was) = (all(skin), all(recorded));
-    let text = |count: usize| format!("of {count} rows");
     if is.len() != was.len() {
-        return Some(("a table", text(is.len()), text(was.len())));
+        return Some(("number of rows", is.len().to_string(), was.len().to_string()));
     }
     let differing = is.iter().zip(&was).enumerate().find(|(_, (one, other))| one != other);
     let row = |(_, a, alpha, d): &(_, f64, f64, f64)| format!("a = {a}, alpha = {alpha}, d = {d}");
-    differing.map(|(_, (one, other))| ("a row of the robot's table", row(one), row(other)))
+    differing.map(|(_, (one, other))| ("row of the robot's table", row(one), row(other)))
 }
 
 fn bus(skin: &Skin, bus: usize) -> &str {
@@ -98,11 +98,13 @@ mod tests {
         other.robot.chains[0].rows[1].table.a = -0.612;
         let said = check_same_skin("run.mcap", &other, &skin).unwrap_err().to_string();
         assert!(
-            said.contains("run.mcap was recorded with another skin: a row of the robot's table a = -0.612"),
+            said.contains(
+                "run.mcap was recorded with a different skin: row of the robot's table: a = -0.612"
+            ),
             "{said}"
         );
         other.cells.clear();
         let (what, is, was) = recorded_skin_difference(&other, &skin).unwrap();
-        assert_eq!((what, is.as_str(), was.as_str()), ("cells", "0", "1"));
+        assert_eq!((what, is.as_str(), was.as_str()), ("number of cells", "0", "1"));
     }
 }

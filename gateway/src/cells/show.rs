@@ -32,7 +32,7 @@ const COLUMNS: [Column; 10] = [
     ("serial", |it| optional_text(it.serial)),
     ("state", DisplayedCell::state),
     ("joint", |it| optional_text(it.joint)),
-    ("up", |it| it.tree.as_ref().map(DisplayedTree::parent_text)),
+    ("parent", |it| it.tree.as_ref().map(DisplayedTree::parent_text)),
     ("depth", |it| optional_text(it.tree.as_ref()?.depth)),
     ("ports", |it| {
         it.ports.as_ref().map(|ports| space_separated(ports.iter().map(DisplayedPort::neighbour_text)))

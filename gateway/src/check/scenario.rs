@@ -187,7 +187,7 @@ impl ScenarioPlan {
         let rows = events.iter().map(PlannedEvent::table_row);
         head + &format!(
             "{}\n{remarks}",
-            table(["at s", "for s", "what", "bus", "cells", "how"], rows, |column| column < 2)
+            table(["start, s", "length, s", "event", "bus", "cells", "details"], rows, |column| column < 2)
         )
     }
 }

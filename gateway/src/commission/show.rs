@@ -76,14 +76,15 @@ impl<'a> DisplayedBus<'a> {
         let cells = format!("{} described", count_with_noun(self.cells.len(), "cell"));
         let others = match self.unknown_nodes.len() {
             0 => String::new(),
-            1 => "1 other cell, left alone".to_owned(),
-            count => format!("{count} other cells, left alone"),
+            1 => "1 cell not described, left unchanged".to_owned(),
+            count => format!("{count} cells not described, left unchanged"),
         };
         rows.add_section(format!("{} ({})", self.name, self.kind), cells, others);
         let compared = "read back, and compared word by word";
         rows.add_row_unless_zero("written", self.written, compared);
-        rows.add_row_unless_zero("already so", self.already_so, "by their hash; --verify reads them back");
-        rows.add_row_unless_zero("already so, verified", self.verified, compared);
+        let by_hash = "according to their hash; --verify reads them back";
+        rows.add_row_unless_zero("already correct", self.already_so, by_hash);
+        rows.add_row_unless_zero("already correct, verified", self.verified, compared);
         rows.add_row_unless_zero("would be written", self.would_write, "");
         rows.add_row_unless_zero("failed", self.failed, "");
         // One row for each reason, whatever the number of cells.
@@ -97,16 +98,17 @@ impl<'a> DisplayedBus<'a> {
             rows.add_row(format!("  {}", abbreviate_names(&cells)), why, "");
         }
         if let Some(failure) = &self.failure {
-            rows.add_row("ended", failure, "");
+            rows.add_row("stopped by an error", failure, "");
         }
         let moved = self.renumbered_cells().count();
         rows.add_row_unless_zero(
-            "with another node id",
+            "with a different node id",
             moved,
-            "than in the description; --node-ids writes a copy",
+            "than described; --node-ids writes a copy with the actual ids",
         );
         rows.add_row_unless_zero("requests", self.requests, format!("{} retries", self.repeated));
-        rows.add_row_unless_zero("frames lost", self.frames_dropped, "they came faster than they were read");
+        let why = "they arrived faster than they were read";
+        rows.add_row_unless_zero("frames lost", self.frames_dropped, why);
     }
 }
 
@@ -122,13 +124,16 @@ impl CommissionResult<'_> {
                 match belongs {
                     None => unknown_nodes.push(format!("{node} (serial number {serial})")),
                     Some(other) => elsewhere.push(format!(
-                        "cell {node} on {name} (serial number {serial}) belongs to {other} according to {file}; left alone"
+                        "cell {node} on {name} (serial number {serial}) belongs to {other} according to {file}; it \
+                         was left unchanged"
                     )),
                 }
             }
             if !unknown_nodes.is_empty() {
                 let unknown_nodes = abbreviate_names(&unknown_nodes);
-                notes.push(format!("cells on {name} that are not in {file}, left alone: {unknown_nodes}"));
+                notes.push(format!(
+                    "cells on {name} that are not in {file} were left unchanged: {unknown_nodes}"
+                ));
             }
             notes.extend(elsewhere);
             let moved = bus.renumbered_cells().count();

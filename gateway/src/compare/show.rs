@@ -70,7 +70,7 @@ impl ComparisonText<'_> {
             return format!("equal{within}: {}", comma_separated(all));
         }
         if epochs.compared == 0 {
-            return "different: no epoch is in both".to_owned();
+            return "different: the two runs have no epoch in common".to_owned();
         }
         let at = first.as_ref().map(|first| {
             let time = first.time_s.a.or(first.time_s.b);
@@ -98,10 +98,10 @@ impl ComparisonText<'_> {
         let none = String::new;
         row("epochs", a.epochs.to_string(), b.epochs.to_string(), format!("{} in both", epochs.compared));
         for (name, a, b, both) in [
-            ("  missing", epochs.missing_in_a, epochs.missing_in_b, "the other has them"),
+            ("  missing", epochs.missing_in_a, epochs.missing_in_b, "present in the other run"),
             ("  before the other", epochs.before.only_a, epochs.before.only_b, "not compared"),
             ("  after the other", epochs.after.only_a, epochs.after.only_b, "not compared"),
-            ("  halted", halts.only_a, halts.only_b, "and the other not"),
+            ("  halted", halts.only_a, halts.only_b, "while the other was not"),
         ] {
             if a + b > 0 {
                 row(name, a.to_string(), b.to_string(), both.to_owned());
@@ -118,7 +118,7 @@ impl ComparisonText<'_> {
         row("joints", none(), none(), replies_text(&only_joints));
         let touched = [contacts.only.only_a, contacts.only.only_b].map(|only| contacts.both + only);
         let [in_a, in_b] = touched.map(|touched| touched.to_string());
-        row("touched, cells x epochs", in_a, in_b, format!("{} in both", contacts.both));
+        row("touched cells x epochs", in_a, in_b, format!("{} in both", contacts.both));
         for (name, replies, a, b) in
             [("torques", torques, a.torques, b.torques), ("sums", sums, a.sums, b.sums)]
         {
@@ -128,7 +128,7 @@ impl ComparisonText<'_> {
             row(name, a.to_string(), b.to_string(), replies_text(replies));
             if replies.missing_count() > 0 {
                 let [a, b] = [replies.missing_in_a, replies.missing_in_b].map(|it| it.to_string());
-                row("  missing", a, b, "the other has them".to_owned());
+                row("  missing", a, b, "present in the other run".to_owned());
             }
         }
         let at = |of: fn(&Quantiles) -> f64, source: &CaptureFigures| {
@@ -141,9 +141,9 @@ impl ComparisonText<'_> {
             ("late replies", (|it| it.late) as fn(&CaptureFigures) -> u64),
             ("lost packets", |it| it.lost),
             ("restarts of cells", |it| it.restarts),
-            ("lost by the recorder", |it| it.dropped),
+            ("frames lost by recorder", |it| it.dropped),
             ("joints out of order", |it| it.out_of_order),
-            ("counts that began again", |it| it.countings.saturating_sub(1).into()),
+            ("restarts of the numbering", |it| it.countings.saturating_sub(1).into()),
         ] {
             if of(a) + of(b) > 0 {
                 row(name, of(a).to_string(), of(b).to_string(), information());
@@ -179,7 +179,7 @@ impl ComparisonText<'_> {
             if total > MAX_LISTED_CELLS {
                 let _ = writeln!(
                     text,
-                    "and {}; --json has all",
+                    "and {}; --json lists all",
                     count_with_noun(total - MAX_LISTED_CELLS, "further cell")
                 );
             }
@@ -188,7 +188,7 @@ impl ComparisonText<'_> {
             let cells = self.report.extra_cells.iter().filter(|cell| cell.only_in == only_in);
             let names: Vec<_> = cells.map(|cell| format!("{}:{}", cell.bus, cell.node)).collect();
             if !names.is_empty() {
-                let _ = writeln!(text, "only {letter} has {}", printable(&abbreviate_names(&names)));
+                let _ = writeln!(text, "cells only in {letter}: {}", printable(&abbreviate_names(&names)));
             }
         }
         text
@@ -254,10 +254,11 @@ impl ComparisonText<'_> {
     fn tolerance_hint(&self, first: &FirstDifference) -> Option<&'static str> {
         match (first.what, first.steps) {
             ("joints", Some(_)) => Some(
-                "a motion depends on when ticks ran: kind = \"hold\" has none, --joints-tolerance and --tolerance allow steps",
+                "the motion depends on the times of ticks: use kind = \"hold\", or allow steps with \
+                 --joints-tolerance and --tolerance",
             ),
             ("torque" | "sum" | "joints", None) if first.how.starts_with("missing") => Some(
-                "a cell leaves out joints that it took too late, on a busy machine: --allow-missing allows some",
+                "on a busy machine, a cell skips joints that it received too late: --allow-missing N accepts some",
             ),
             _ => None,
         }
@@ -307,7 +308,7 @@ impl ComparisonText<'_> {
         let CompareReport { epochs, joints, halts, contacts, torques, sums, extra_cells, .. } = self.report;
         let missing = |a, b| format!("{a} missing in A, {b} in B");
         match aspect {
-            "epochs" if epochs.compared == 0 => "no epoch is in both".to_owned(),
+            "epochs" if epochs.compared == 0 => "the two runs have no epoch in common".to_owned(),
             "epochs" => missing(epochs.missing_in_a, epochs.missing_in_b),
             "joints" => format!("{} different, at most {} steps", joints.different, joints.max_steps),
             "halts" => format!("{} only in A, {} only in B", halts.only_a, halts.only_b),
@@ -325,13 +326,13 @@ impl ComparisonText<'_> {
 fn replies_text(replies: &ReplyCounts) -> String {
     let ReplyCounts { equal, tolerated, different, open, max_steps, .. } = *replies;
     let mut all = vec![format!("{equal} equal")];
-    for (count, what) in [(tolerated, "tolerated"), (different, "different"), (open, "open")] {
+    for (count, what) in [(tolerated, "tolerated"), (different, "different"), (open, "undecided")] {
         if count > 0 {
             all.push(format!("{count} {what}"));
         }
     }
     if max_steps > 0 {
-        all.push(format!("max {max_steps} off"));
+        all.push(format!("max {max_steps} steps"));
     }
     comma_separated(all)
 }

@@ -66,7 +66,7 @@ impl ConformanceResult {
             let about = if more.is_empty() { title.to_owned() } else { format!("{title}: {more}") };
             vec![it.requirement.id.to_owned(), verdict.to_owned(), about]
         });
-        let table = limit_width(table(["requirement", "", ""], rows, |_| false));
+        let table = limit_width(table(["requirement", "verdict", "details"], rows, |_| false));
         let mut text = format!("{table}\n");
         for it in &self.requirements {
             let Verdict::Failed { what, failures, frames } = &it.verdict else { continue };

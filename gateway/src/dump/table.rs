@@ -23,11 +23,7 @@ pub(super) fn report_text(
 ) -> String {
     let head = format!("{what}, {:.3} s", report.duration_s);
     let mut rows = KeyValueTable::new(name, head, print::count_with_noun(report.frames, "frame"));
-    rows.add_row_unless_zero(
-        "frames before the one before them",
-        report.times_backwards,
-        "times run backwards",
-    );
+    rows.add_row_unless_zero("frames out of order", report.times_backwards, "earlier than the frame before");
     rows.add_row_unless_zero("frames missing", report.dropped, "lost by the recorder");
     rows.add_row_unless_zero("frames of further buses", report.frames_of_other_buses, "beyond the first 64");
     for bus in &report.buses {
@@ -74,9 +70,9 @@ fn bus_rows(rows: &mut KeyValueTable, bus: &BusReport, duration_s: f64) {
         rows.add_row("epochs", format!("{first} to {last}"), odd);
     }
     rows.add_row_unless_zero(
-        "wires",
+        "simulated wires",
         bus.wires,
-        format!("{}, on no real bus", rate_text(bus.wires_per_s, bus.wires_span_s)),
+        format!("{}, not on a real bus", rate_text(bus.wires_per_s, bus.wires_span_s)),
     );
     let refused: Vec<_> =
         bus.refused.counts_by_reason().into_iter().filter(|(_, count)| *count > 0).collect();
@@ -90,7 +86,7 @@ fn bus_rows(rows: &mut KeyValueTable, bus: &BusReport, duration_s: f64) {
     rows.add_row_unless_zero("  error frames", error, comma_separated(error_counts(&bus.foreign)));
     if packets_by_chance >= 0.05 {
         let chance = format!("{packets_by_chance:.1}");
-        rows.add_row("  packets by chance", chance, "expected");
+        rows.add_row("  packets by chance", chance, "expected number");
     }
     let why = if bus.dropped > 0 { "lost by the recorder" } else { "" };
     rows.add_row("frames missing", bus.dropped, why);
@@ -128,16 +124,8 @@ const MAX_FOREIGN: usize = 40;
 
 /// Formats a table with one line per foreign identifier, the most frequent ones first.
 fn foreign_identifier_table(bus: &BusReport) -> Table {
-    let head = [
-        &format!("{} foreign", printable(&bus.bus)),
-        "frames",
-        "per s",
-        "in s",
-        "first s",
-        "last s",
-        "bytes",
-        "",
-    ];
+    let head =
+        [&format!("{} foreign", printable(&bus.bus)), "frames", "per s", "over s", "first s", "bytes", ""];
     let line = |id: &ForeignId| {
         let (min, most) = (id.bytes_min, id.bytes_max);
         let bytes = if min == most { min.to_string() } else { format!("{min}..{most}") };
@@ -179,19 +167,19 @@ fn cell_table(bus: &BusReport) -> Table {
         (&name, |cell| Some(cell.node.to_string())),
         ("torques", |cell| Some(cell.torques.to_string())),
         ("per s", |cell| cell.torques_per_s.map(|rate| format!("{rate:.1}"))),
-        ("in s", |cell| cell.torques_per_s.map(|_| seconds_text(cell.torques_span_s))),
+        ("over s", |cell| cell.torques_per_s.map(|_| seconds_text(cell.torques_span_s))),
         ("epochs", |cell| Some(format!("{}..{}", cell.first_epoch?, cell.last_epoch?))),
         ("unanswered", |cell| blank_if_zero(cell.unanswered)),
-        ("twice", |cell| blank_if_zero(cell.repeated)),
+        ("repeated", |cell| blank_if_zero(cell.repeated)),
         ("sums", |cell| blank_if_zero(cell.sums)),
-        ("again", |cell| blank_if_zero(cell.resent)),
+        ("resent", |cell| blank_if_zero(cell.resent)),
         ("parent", |cell| match cell.parent? {
             0 => Some("gateway".to_owned()),
             parent => Some(parent.to_string()),
         }),
         ("depth", |cell| cell.depth.map(|depth| depth.to_string())),
-        ("satur.", |cell| blank_if_zero(cell.saturated)),
-        ("beats", |cell| Some(cell.heartbeats.to_string())),
+        ("saturated", |cell| blank_if_zero(cell.saturated)),
+        ("heartbeats", |cell| Some(cell.heartbeats.to_string())),
         ("refused", |cell| blank_if_zero(cell.refused?.into())),
         ("lost", |cell| blank_if_zero(cell.lost)),
         ("starts", |cell| blank_if_zero(cell.restarts)),

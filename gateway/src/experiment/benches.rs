@@ -66,7 +66,7 @@ impl BenchRunner {
         let summary = read_summary(&what, &files.summary)?;
         let joints = Skin::parse("the arm's skin", &text).map_err(Failure::run_error)?.robot.joints.len();
         if rows.is_empty() {
-            return Err(file_error(&what, &recording, &"it has no ticks"));
+            return Err(file_error(&what, &recording, &"it contains no ticks"));
         }
         Ok(BenchRun { rows, summary, joints })
     }

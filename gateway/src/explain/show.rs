@@ -59,7 +59,7 @@ pub(super) fn format_explanation(
         text += &format_joint_totals(&explanation.total, is_finest);
     }
     if !explanation.missing.is_empty() {
-        text += "\nnot known:\n";
+        text += "\nmissing information:\n";
         for line in &explanation.missing {
             text += &format!("  {line}\n");
         }
@@ -148,7 +148,7 @@ fn format_torques(cells: &[CellExplanation]) -> String {
         let mut head = vec![names.column_heading()];
         head.extend((part == 0).then(|| "F_z N".to_owned()));
         head.extend(joints.iter().map(|row| format!("{} {}", row.unit, row.joint)));
-        head.extend(["off", "which is"].iter().filter(|_| is_last).map(|&name| name.to_owned()));
+        head.extend(["steps", "verdict"].iter().filter(|_| is_last).map(|&name| name.to_owned()));
         let lines = cells.iter().map(|cell| {
             let mut line = vec![names.name_of_cell(cell)];
             line.extend((part == 0).then(|| format_decimals(force_n(cell), 3, "?")));
@@ -216,7 +216,7 @@ fn verdict_info(verdict: &WordVerdict) -> (u8, &'static str, Option<String>) {
             let means = "the product is beyond the range of the torque format: the word is saturated";
             (2, "saturated", Some(means.to_owned()))
         }
-        WordVerdict::Open => (3, "open", None),
+        WordVerdict::Open => (3, "unknown", None),
         WordVerdict::Unexplained => {
             let means = format!(
                 "no J within {MAX_JACOBIAN_ERROR_STEPS} steps of the exact one, plus one step for each row after the sixth, gives this word"
@@ -314,7 +314,7 @@ fn format_joint_rows(cells: &[CellExplanation], by_cell: bool) -> String {
     let first = if by_cell { names.column_heading() } else { "joint".to_owned() };
     let mut head = vec![first];
     head.extend(by_cell.then(|| "F_z N".to_owned()));
-    head.extend(["J m", "J F_z Nm", "nearest", "word", "Nm", "off", "which is"].map(str::to_owned));
+    head.extend(["J m", "J F_z Nm", "nearest", "word", "Nm", "steps", "verdict"].map(str::to_owned));
     let line = |cell: &CellExplanation, row: &TorqueRow| {
         let mut line = vec![if by_cell { names.name_of_cell(cell) } else { joint_name(row.joint, row.unit) }];
         line.extend(by_cell.then(|| format_decimals(force_n(cell), 2, "?")));

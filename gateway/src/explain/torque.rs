@@ -146,7 +146,7 @@ impl<'a> Calculator<'a> {
         let joints: Vec<_> = skin.joints_on_bus(cell.bus).map(|(_, joint)| joint).collect();
         if !(0.0..=MAX_FORCE_N).contains(&force) {
             return Err(format!(
-                "force {force} N: the force against the outward normal can be 0 to {MAX_FORCE_N:.3} N, the range of \
+                "force {force} N: the force against the outward normal must be 0 to {MAX_FORCE_N:.3} N, the range of \
                  three contact words"
             ));
         }
@@ -164,7 +164,7 @@ impl<'a> Calculator<'a> {
                 text.parse().ok().and_then(|value: f64| Some((value, joint.kind.position_to_word(value)?)));
             let Some((position, nearest)) = position else {
                 return Err(format!(
-                    "position {text:?} of {}: a number in {} is needed",
+                    "position {text:?} of {}: use a number in {}",
                     joint.name,
                     joint.kind.unit()
                 ));

@@ -31,7 +31,7 @@ impl FitCommand {
             let without = skin.buses.iter().filter(|bus| bus.bitrate.is_none()).map(|bus| &bus.name);
             let (without, skin) = (comma_separated(without), &skin.name);
             print_note(format_args!(
-                "no bitrate of {without}: these are common bit rates, not those of {skin}"
+                "the skin {skin} gives no bitrate for {without}, so the table lists common bit rates"
             ));
         }
         print_text(&match self.json {

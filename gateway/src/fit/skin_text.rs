@@ -16,7 +16,7 @@ const TABLE_HEADER: [&str; 8] = [
     "packet\nµs",
     "load\n%",
     "last\nms",
-    "cells\na bus",
+    "cells\nper bus",
     "buses\nneeded",
     "roots:\nload %",
     "roots:\nlast ms",
@@ -50,12 +50,12 @@ pub(super) fn table(skin: &Skin, rows: &[RatesRow]) -> String {
         ),
     };
     format!(
-        "{}: {bus}, joints every {} ms, a cell computes {} µs\n{table}\n\
+        "{}: {bus}, joints every {} ms, each cell computes for {} µs\n{table}\n\
          load    worst case: all cells answer; joints, {}, heartbeats{}\n\
-         last    longest time from when the joints are due to the end of the last answer\n\
-         cells   number that a bus has time for; transceivers drive about {}\n\
-         buses   number needed for {cells} cells, and the limit that decides it: time or nodes\n\
-         roots   sums if only roots are on this bus; with all cells on it, sums save no frames\n",
+         last    longest time from the scheduled joints message to the end of the last answer\n\
+         cells   number of cells that a bus can serve in time; transceivers can drive about {}\n\
+         buses   number of buses that {cells} cells need, and the limit that determines it: time or nodes\n\
+         roots   result with sums if only the roots are on this bus; with all cells on it, sums save no frames\n",
         printable(&skin.name),
         format_millis(case.period_ns),
         format_micros(case.computation_ns),
@@ -70,7 +70,7 @@ pub(super) fn format_bus_fits(skin: &Skin, buses: &[BusFit], whole: Option<&Skin
     let Some(first) = buses.first() else { return String::new() };
     let case = &first.rated.case;
     let period = format!("joints every {} ms", format_millis(case.period_ns));
-    let computation = format!("a cell computes {} µs", format_micros(case.computation_ns));
+    let computation = format!("each cell computes for {} µs", format_micros(case.computation_ns));
     let mut rows = KeyValueTable::new(&skin.name, period, computation).names_in_one_line();
     for bus in buses {
         add_bus_section(&mut rows, bus);
@@ -108,18 +108,18 @@ fn add_bus_section(rows: &mut KeyValueTable, bus: &BusFit) {
         .filter(|it| it.1 > 0.0)
         .map(|(what, share)| format!("{what} {}", format_percent_number(*share)));
     rows.add_row("  load", format_percent(load.total()), comma_separated(parts));
-    let bounds = [("chain", times.chain_ns), ("analysis", times.response_ns.map(|it| it.worst_ns))];
+    let bounds = [("by chain", times.chain_ns), ("by analysis", times.response_ns.map(|it| it.worst_ns))];
     let bounds = bounds.iter().filter_map(|(how, ns)| Some(format!("{how} {}", format_millis((*ns)?))));
     let due = format!("due after {} ms", format_millis(case.deadline_ns()));
     rows.add_row("last answer", format_last_answer(rated), comma_separated([due].into_iter().chain(bounds)));
     let heartbeat =
         or_else_text(times.heartbeat_ns.map(|ns| format!("{} ms", format_millis(ns))), "no bound");
-    rows.add_row("heartbeats late by", heartbeat, "silent for 600 ms is dead");
+    rows.add_row("heartbeats delayed by", heartbeat, "a cell silent for 600 ms counts as dead");
     let others = format!("bandwidth {}, deadline {}, nodes {}", most.bandwidth, most.deadline, most.nodes);
     rows.add_row("cells that fit", most.max_cells_in_time().min(most.nodes), others);
     rows.add_row("buses needed", format_needed_buses(need), format_each_need(need));
     if !hints.is_empty() {
-        rows.add_section("  what to change", "", "");
+        rows.add_section("  possible changes", "", "");
         for hint in hints {
             rows.add_row(
                 format!("  {}", hint.change),
@@ -128,7 +128,7 @@ fn add_bus_section(rows: &mut KeyValueTable, bus: &BusFit) {
             );
         }
     }
-    rows.add_section("  instead of these answers", "", "");
+    rows.add_section("  other kinds of answers", "", "");
     for hint in answers {
         rows.add_row(
             format!("  {}", hint.change),
@@ -183,7 +183,7 @@ fn last_ms(rated: &AssessedBus) -> String {
 fn format_needed_buses(need: &NeededBuses) -> String {
     let why = comma_separated(need.binding_limits().into_iter().map(Limit::name));
     match need.required_buses() {
-        None => format!("none: {why}"),
+        None => format!("impossible: {why}"),
         Some(1) => "1".to_owned(),
         Some(buses) => format!("{buses}: {why}"),
     }
@@ -191,7 +191,7 @@ fn format_needed_buses(need: &NeededBuses) -> String {
 
 fn format_each_need(need: &NeededBuses) -> String {
     let needs = [("bandwidth", need.bandwidth), ("deadline", need.deadline), ("nodes", need.nodes)];
-    comma_separated(needs.map(|(name, buses)| format!("{name} {}", or_else_text(buses, "no number"))))
+    comma_separated(needs.map(|(name, buses)| format!("{name} {}", or_else_text(buses, "impossible"))))
 }
 
 #[expect(clippy::cast_precision_loss, reason = "printed with few digits")]

@@ -73,7 +73,7 @@ impl FitCommand {
         }
         for (bus, _) in &self.rates {
             if report.buses.iter().all(|it| it.bus != *bus) {
-                output::print_note(format_args!("--rates {bus}=…: {name} has no frame of {bus}"));
+                output::print_note(format_args!("--rates {bus}=…: {name} contains no frame of bus {bus}"));
             }
         }
         if !self.json && report.frames > 0 {
@@ -88,7 +88,7 @@ impl FitCommand {
             0 => return Ok(false),
             files if files < self.sources.len() => {
                 return Err(Failure::usage_error(format!(
-                    "{name}: name one file, the parts of one recording, or only buses"
+                    "{name}: files and buses cannot be mixed: name one file, the parts of one recording, or only buses"
                 )));
             }
             _ => {}

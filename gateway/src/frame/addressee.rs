@@ -11,5 +11,5 @@ pub(super) const fn single_cell(addressee: &NodeSelector) -> Option<CellId> {
 /// Parses an addressee: a cell or all cells, but not the gateway.
 pub(super) fn addressee(text: &str) -> Result<NodeSelector, String> {
     let party = text.parse().ok().filter(|party: &NodeSelector| party.node != Node::Gateway);
-    party.ok_or_else(|| "a node id, 1 to 254, BUS:NODE, or everyone is possible".to_owned())
+    party.ok_or_else(|| "use a node id from 1 to 254, BUS:NODE, or everyone".to_owned())
 }

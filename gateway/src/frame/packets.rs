@@ -15,16 +15,16 @@ use super::sensing;
 
 #[derive(Debug, Subcommand)]
 pub(super) enum PacketCommand {
-    /// Stop answering until a resume
+    /// Make cells stop answering until a resume
     #[command(after_help = "Example:\n  skinbus frame halt")]
     Halt,
-    /// Leave the halted state
+    /// Make cells leave the halted state
     #[command(after_help = "Example:\n  skinbus frame resume")]
     Resume,
-    /// Answer with a heartbeat when all work for the last joints is done
+    /// Make cells answer with a heartbeat when all work for the last joints is done
     #[command(after_help = "Example:\n  skinbus frame sync")]
     Sync,
-    /// Answer with the pages of counters and sensors
+    /// Make cells answer with the pages of counters and sensors
     #[command(after_help = "Example:\n  skinbus frame report")]
     Report,
     Joints(JointsCommand),
@@ -168,7 +168,7 @@ impl JointsCommand {
         let (name, texts, read): (_, _, fn(&str) -> _) = match (rad, words) {
             (Some(rad), _) => ("--rad", rad, parameter::parse_angle),
             (None, words) => {
-                ("--words", words.as_ref().ok_or("--rad or --words is needed")?, parameter::parse_raw_word)
+                ("--words", words.as_ref().ok_or("use --rad or --words")?, parameter::parse_raw_word)
             }
         };
         if texts.len() > MAX_JOINTS {
@@ -219,7 +219,7 @@ impl ConfigureCommand {
                 let (number, words) = parameter::parse_write(name, values).map_err(wrong)?;
                 Request::Write { number, words }
             }
-            (None, None | Some([])) => return Err("--read or --write is needed".to_owned()),
+            (None, None | Some([])) => return Err("use --read or --write".to_owned()),
         };
         Ok(Message::Configure { to: self.cell.node, tag: self.tag, request })
     }
@@ -308,10 +308,7 @@ mod tests {
             "--temperature 512: it must be in [-512, 512)"
         );
         for wrong in ["0", "255", "gateway", "-1", "x", "vcan0:0", ":3", ""] {
-            assert_eq!(
-                addressee(wrong).unwrap_err(),
-                "a node id, 1 to 254, BUS:NODE, or everyone is possible"
-            );
+            assert_eq!(addressee(wrong).unwrap_err(), "use a node id from 1 to 254, BUS:NODE, or everyone");
         }
         assert_eq!(says("configure --cell 12 --write mode 2"), "mode = 2: 0 measures, 1 obeys stimuli");
     }

@@ -45,8 +45,8 @@ enum SensingMode {
 }
 
 const MODES: &[OptionValue<SensingMode>] = &[
-    ("off", "Only on a report", SensingMode::Off),
-    ("continuous", "At a rate", SensingMode::Continuous),
+    ("off", "Only on a report command", SensingMode::Off),
+    ("continuous", "At a fixed rate", SensingMode::Continuous),
     ("event", "On changes, and with each heartbeat", SensingMode::Event),
 ];
 

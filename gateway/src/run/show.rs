@@ -49,14 +49,14 @@ fn verdict(summary: &Summary, look: TableStyle, columns: usize) -> String {
     let mut lines = Vec::new();
     if summary.verdict.well {
         let is_interrupted = summary.outcome == Outcome::Interrupted;
-        let begin = if is_interrupted { "all well until it was interrupted: " } else { "all well: " };
+        let begin = if is_interrupted { "all well until the run was interrupted: " } else { "all well: " };
         lines.push(hanging_indent("", &format!("{begin}{}", printable(&summary.totals_line())), columns));
     }
     let many = if look.is_verbose { look_at.len() } else { MAX_VERDICT_LINES };
     let more = look_at.len().saturating_sub(many);
-    let more = (more > 0).then(|| format!("and {more} more, with --verbose"));
+    let more = (more > 0).then(|| format!("and {more} more: use --verbose"));
     for (at, item) in look_at.iter().take(many).chain(&more).enumerate() {
-        let begin = if at == 0 { "look at: " } else { "         " };
+        let begin = if at == 0 { "problems: " } else { "          " };
         lines.push(hanging_indent(begin, &printable(item), columns));
     }
     let text = lines.join("\n");
@@ -85,11 +85,7 @@ fn summary_rows(summary: &Summary, look: TableStyle) -> KeyValueTable {
     rows = rows.with_colours(look.is_coloured);
     add_halt_sections(&mut rows, summary);
     for error in &summary.cell_errors {
-        rows.add_section(
-            "ended by errors of their own",
-            count_with_noun(error.count(), "cell"),
-            &error.reason,
-        );
+        rows.add_section("cells ended by an error", count_with_noun(error.count(), "cell"), &error.reason);
         rows.add_row("cells", error.names(), "");
     }
     add_accuracy_rows(&mut rows, summary, is_verbose);
@@ -113,7 +109,7 @@ fn add_halt_sections(rows: &mut KeyValueTable, summary: &Summary) {
         rows.add_section(
             "halted",
             format!("{} more", count_with_noun(more, "time")),
-            "--summary has when and why",
+            "--summary lists times and reasons",
         );
     }
 }
@@ -168,14 +164,14 @@ fn add_accuracy_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bo
         }
     }
     rows.add_row_unless_zero(
-        "saturated words, left out",
+        "saturated words, not compared",
         accuracy.saturated,
         "beyond the range of the torque format",
     );
 }
 
 fn format_mean_and_max(errors: &TorqueErrors) -> String {
-    or_else_text(errors.mean().map(|mean| format!("{mean:.2e} ({:.1e})", errors.max())), "nothing compared")
+    or_else_text(errors.mean().map(|mean| format!("{mean:.2e} ({:.1e})", errors.max())), "not compared")
 }
 
 fn format_torque_count(errors: &TorqueErrors) -> String {
@@ -186,16 +182,20 @@ fn add_control_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: boo
     let control = &summary.control;
     rows.add_section("control loop", "median / 90 % / 99 % / max", "µs");
     rows.add_row(
-        "began late",
+        "tick lateness",
         format_quantiles(&control.late_us),
         format!("idle {}", format_quantiles(&control.idle_late_us)),
     );
     if is_verbose && control.central_us.count > 0 {
-        rows.add_row("tick", format_quantiles(&control.took_us), "");
-        rows.add_row("  central computation in it", format_quantiles(&control.central_us), "distributed: 0");
+        rows.add_row("tick duration", format_quantiles(&control.took_us), "");
+        rows.add_row(
+            "  central computation in it",
+            format_quantiles(&control.central_us),
+            "distributed computation: 0",
+        );
     }
     if is_verbose && control.took_distributed_us.count > 0 {
-        rows.add_row("tick, distributed", format_quantiles(&control.took_distributed_us), "");
+        rows.add_row("tick duration, distributed", format_quantiles(&control.took_distributed_us), "");
     }
     let counts = [
         ("ticks", control.ticks, control.ticks_skipped),
@@ -225,16 +225,16 @@ fn add_reply_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) 
     rows.add_section(&bus.name, counts_by_kind(&bus.cells), &bus.kind);
     if bus.outages.times > 0 {
         let end = if bus.outages.at_end { ", also at the end" } else { "" };
-        let ticks = format!("{} without it", count_with_noun(bus.outages.ticks, "tick"));
+        let ticks = format!("{} without the bus", count_with_noun(bus.outages.ticks, "tick"));
         let times = count_with_noun(bus.outages.times, "time");
-        rows.add_row("lost", format!("{times}, {:.1} s{end}", bus.outages.lost_s), ticks);
+        rows.add_row("bus lost", format!("{times}, {:.1} s{end}", bus.outages.lost_s), ticks);
     }
     for it in &bus.hosts {
-        let gone =
-            (it.gone > 0).then(|| format!("gone {}, {:.1} s", count_with_noun(it.gone, "time"), it.gone_s));
-        let end = (!it.at_end).then(|| "not reached at the end".to_owned());
+        let gone = (it.gone > 0)
+            .then(|| format!("unreachable {}, {:.1} s", count_with_noun(it.gone, "time"), it.gone_s));
+        let end = (!it.at_end).then(|| "unreachable at the end".to_owned());
         let lost = comma_separated(
-            [(it.lost_from, "from there"), (it.lost_to, "to there")]
+            [(it.lost_from, "from this host"), (it.lost_to, "to this host")]
                 .map(|(n, way)| format!("{} lost {way}", count_with_noun(n, "frame"))),
         );
         let cells = count_with_noun(it.cells, "cell");
@@ -331,13 +331,13 @@ fn add_sum_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
         let tree_ready =
             or_else_text(network.tree_ready_s.map(|s| format!("complete in {s:.2} s")), "never complete");
         let changes = count_with_noun(network.parent_changes, "change");
-        rows.add_row("tree, wires deep", network.deepest, format!("{tree_ready}, {changes} of parents"));
+        rows.add_row("tree depth, wires", network.deepest, format!("{tree_ready}, {changes} of parents"));
     }
     if !network.unreachable.is_empty() {
         rows.add_row("unreachable cells", space_separated(&network.unreachable), "no sum contains them");
     }
     for difference in &network.differences {
-        rows.add_row("not as described", difference, "");
+        rows.add_row("differs from the skin", difference, "");
     }
 }
 
@@ -365,8 +365,10 @@ fn add_due_rows(
     complete: String,
     [contact_unknown, unexpected]: [u64; 2],
 ) {
-    let reasons =
-        [(contact_unknown, "their contact is not known"), (unexpected, "nothing touched their cells")];
+    let reasons = [
+        (contact_unknown, "the contact of their cells is unknown"),
+        (unexpected, "nothing touched their cells"),
+    ];
     let mut reasons = reasons.into_iter().filter(|(count, _)| *count > 0);
     let beside = if due == 0 { reasons.next() } else { None };
     match beside {
@@ -382,8 +384,8 @@ fn add_due_rows(
 
 /// Adds a row on the age of joints that cells have not received.
 fn add_joint_age_row(rows: &mut KeyValueTable, bus: &BusSummary) {
-    let why = "large: busy machine; losses: see the bus";
-    rows.add_row("joint age at heartbeat, µs", format_quantiles(&bus.joints_not_taken_us), why);
+    let why = "a large age means a busy machine or lost frames";
+    rows.add_row("age of joints not received, µs", format_quantiles(&bus.joints_not_taken_us), why);
 }
 
 /// Converts a key of the summary to words.
@@ -411,7 +413,7 @@ fn add_noteworthy_cell_rows(rows: &mut KeyValueTable, bus: &BusSummary, all: &[C
         rows.add_row(
             "cells that measure",
             space_separated(measuring),
-            "not pressed, their torques not compared",
+            "not pressed; their torques were not compared",
         );
     }
     let unclear: Vec<_> =
@@ -420,15 +422,15 @@ fn add_noteworthy_cell_rows(rows: &mut KeyValueTable, bus: &BusSummary, all: &[C
         rows.add_row(
             "cells of unknown contact",
             space_separated(unclear),
-            "stimuli from before this run, or a baseline",
+            "because of earlier stimuli or a baseline",
         );
     }
     for cell in all().filter(|cell| !cell.stuck.is_empty()) {
-        let kinds = cell.stuck.iter().map(|(kind, count)| format!("{count} times one {kind}"));
+        let kinds = cell.stuck.iter().map(|(kind, count)| format!("{count} equal {kind} words"));
         rows.add_row(
             format!("stuck: cell {}", cell.node),
             comma_separated(kinds),
-            "while it should have sent others",
+            "although the expected words changed",
         );
     }
     let is_off = |cell: &CellSummary| cell.error.mean().is_some_and(|mean| mean > MAX_CELL_ERROR_NM);
@@ -448,7 +450,7 @@ fn add_noteworthy_cell_rows(rows: &mut KeyValueTable, bus: &BusSummary, all: &[C
         rows.add_row(format!("cell {}", cell.node), or_else_text(in_time, ""), comma_separated(why));
     }
     let more = worst.len().saturating_sub(MAX_LISTED_CELLS);
-    rows.add_row_unless_zero("further cells that stand out", more as u64, "--summary has each cell");
+    rows.add_row_unless_zero("further cells with problems", more as u64, "--summary lists each cell");
 }
 
 fn add_cost_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) {

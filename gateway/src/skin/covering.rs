@@ -71,7 +71,8 @@ fn keep_out(text: &str) -> Result<ExcludedBox, String> {
         is_box.then(|| ExcludedBox { link: link.trim().to_owned(), min, max, text: text.to_owned() })
     };
     parsed().ok_or_else(|| {
-        "a link, a colon, and six lengths in m: the min x, y, z of the box and the max".to_owned()
+        "use a link, a colon, and six lengths in m: the minimum and then the maximum x, y, z of the box"
+            .to_owned()
     })
 }
 

@@ -176,8 +176,7 @@ fn cells(path: &Path) -> Result<Vec<CellOnLink>, Failure> {
         let node = match row.text("node") {
             "" => None,
             text => {
-                let wrong =
-                    |_| row.value_error("node", "1 to 254 are possible; an empty one gets a free node");
+                let wrong = |_| row.value_error("node", "use 1 to 254, or leave it empty for a free node id");
                 Some(text.parse::<CellId>().map_err(wrong)?.get())
             }
         };

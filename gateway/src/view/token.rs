@@ -68,7 +68,7 @@ fn read(path: &Path) -> Result<Token, Failure> {
     let others =
         file.metadata().ok().filter(|about| about.is_file() && about.permissions().mode() & 0o077 != 0);
     if others.is_some() {
-        print_note(format_args!("--token-file {name}: other users may read it; `chmod 600` keeps it to you"));
+        print_note(format_args!("--token-file {name}: other users may read it; protect it with `chmod 600`"));
     }
     Ok(token)
 }

@@ -127,9 +127,9 @@ fn lines_that_cannot_be_read_are_named_and_the_others_shown() {
     assert_eq!(decoded(text(&stdout)), ["ok      halt", "foreign remote frame"]);
     let name = file.display();
     let expected = format!(
-        "{name}:2: column 18: an identifier of 3 or 8 hexadecimal digits\n\
+        "{name}:2: column 18: expected an identifier of 3 or 8 hexadecimal digits\n\
          {name}:3: 12 frames are missing here: the recorder lost them\n\
-         {name}:4: column 18: an identifier of 3 or 8 hexadecimal digits\n\
+         {name}:4: column 18: expected an identifier of 3 or 8 hexadecimal digits\n\
          {name}: 2 of 6 lines could not be read\n\
          {name}: CAN XL frames are not shown: 1\n"
     );
@@ -242,7 +242,7 @@ fn wrong_use_is_one_line_and_exit_code_2() {
     for (arguments, expected) in [
         (
             "frame stimulus --cell 300",
-            "invalid value '300' for '--cell <[BUS:]NODE>': a node id, 1 to 254, BUS:NODE, or everyone is possible; \
+            "invalid value '300' for '--cell <[BUS:]NODE>': use a node id from 1 to 254, BUS:NODE, or everyone; \
              try '--help'",
         ),
         (
@@ -260,7 +260,8 @@ fn wrong_use_is_one_line_and_exit_code_2() {
         ("frame configure --cell 12 --write mode 2", "mode = 2: 0 measures, 1 obeys stimuli"),
         (
             "dump run.log --from -1",
-            "invalid value '-1' for '--from <S>': a time from 0 s to 1e9 s (10, 500ms, 90s, 10min, 2h); try '--help'",
+            "invalid value '-1' for '--from <S>': use a time from 0 s to 1e9 s, such as 10, 500ms, 90s, 10min or 2h; \
+             try '--help'",
         ),
         ("dump / ", "/ is a directory: name a candump log or buses"),
         (
@@ -273,14 +274,15 @@ fn wrong_use_is_one_line_and_exit_code_2() {
             "unexpected argument scenario.toml after the skin: to use a scenario, write --scenario scenario.toml",
         ),
         ("skin chek", "unrecognized subcommand 'chek'; try '--help'"),
-        ("dump nosuch.mcap", "there is no file nosuch.mcap, and no bus of this name: correct the path"),
-        ("dump a/b.log", "there is no file a/b.log, and no bus of this name: correct the path"),
+        ("dump nosuch.mcap", "there is no file and no bus named nosuch.mcap: correct the path"),
+        ("dump a/b.log", "there is no file and no bus named a/b.log: correct the path"),
     ] {
         assert_eq!(refusal(arguments, 2), format!("skinbus: {expected}"), "{arguments}");
     }
     for command in ["dump", "fit"] {
         let said = refusal(&format!("{command} nosuch --bus-kind embedded"), 2);
-        let expected = "skinbus: there is no file nosuch, and it does not open as a bus: no embedded bus nosuch is served in ";
+        let expected = "skinbus: there is no file nosuch, and opening it as a bus failed: no embedded bus nosuch is \
+                        served in ";
         assert!(said.starts_with(expected), "{said}");
     }
     let said = refusal("list", 2);
@@ -288,7 +290,7 @@ fn wrong_use_is_one_line_and_exit_code_2() {
     assert!(said.contains(", cells, "), "{said}");
     let skin = format!("{}/Cargo.toml", env!("CARGO_MANIFEST_DIR"));
     let said = refusal(&format!("dump {skin}"), 1);
-    assert!(said.contains("there is no frame in "), "{said}");
+    assert!(said.contains("no frame in "), "{said}");
 }
 
 #[test]
@@ -407,12 +409,13 @@ fn what_is_wrong_with_a_scenario_has_a_line_and_a_column() {
     let wrong = said("[[touch]]\ncells = [1, 9]\nforce_n = 3.0\n");
     assert_eq!(
         wrong,
-        "skinbus: s.toml:2:13: touch[0].cells[1] = 9: no cell of \"vcan0\" has node 9: it has 1-3"
+        "skinbus: s.toml:2:13: touch[0].cells[1] = 9: no cell of \"vcan0\" has node id 9: it has 1-3"
     );
     let drop = "[[fault]]\nat_s = 1.0\nkind = \"drop\"\nprobability = 0.5\n";
     let refused = said(drop);
     assert!(
-        refused.starts_with("skinbus: the fault \"drop\" of vcan0 at 1 s works only in virtual time"),
+        refused
+            .starts_with("skinbus: the scenario's fault \"drop\" of vcan0 at 1 s works only in virtual time"),
         "{refused}"
     );
 }
@@ -424,7 +427,7 @@ fn times_are_taken_with_and_without_a_unit() {
     assert_ne!(shown("2ms"), shown("2s"));
     for wrong in ["10x", "s", "0s", "-1min"] {
         let said = refusal(&format!("run skin.toml --duration={wrong}"), 2);
-        assert!(said.contains("a time above 0 s, up to 1e7 s (10, 500ms, 90s, 10min, 2h)"), "{said}");
+        assert!(said.contains("use a time above 0 s, up to 1e7 s, such as 10, 500ms, 90s"), "{said}");
     }
     let said = refusal("run nosuch.toml --duration 10s --record-split 1.5min --record x.mcap", 2);
     assert!(said.contains("nosuch.toml: No such file"), "both are taken: {said}");
@@ -437,7 +440,7 @@ fn a_report_says_that_it_is_no_recording_before_that_the_page_is_there() {
     std::fs::write(&file, "{}").unwrap();
     std::fs::write(file.with_extension("html"), "").unwrap();
     let said = refusal(&format!("report {}", file.display()), 2);
-    assert!(said.contains("x.json is a log, which has only frames"), "{said}");
+    assert!(said.contains("x.json is a candump log, which contains only frames"), "{said}");
 }
 
 fn names(directory: &Path) -> Vec<String> {
@@ -484,7 +487,7 @@ fn what_is_no_file_or_too_long_is_not_read() {
     std::fs::File::create(&long).unwrap().set_len((16 << 20) + 1).unwrap();
     let long = long.to_str().unwrap();
     let too_long = "it is longer than 16777216 bytes, the maximum";
-    for (file, why) in [("/dev/zero", "it is a device, a file is needed"), (long, too_long)] {
+    for (file, why) in [("/dev/zero", "it is a device, but a file is needed"), (long, too_long)] {
         for command in [
             format!("check {file}"),
             format!("skin import {file} --tip hand"),

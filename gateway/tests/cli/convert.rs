@@ -153,13 +153,10 @@ fn what_is_no_capture_is_refused_by_its_name() {
         folder.refuses("convert run.zip run.mcap", 2),
         "skinbus: run.zip is a zip archive, not a candump log or MCAP recording: unpack it first"
     );
-    assert_eq!(
-        folder.refuses("convert empty.log run.mcap", 1),
-        "skinbus: empty.log: it is empty: there is no frame in it"
-    );
+    assert_eq!(folder.refuses("convert empty.log run.mcap", 1), "skinbus: empty.log: the file is empty");
     assert_eq!(
         folder.refuses("convert words.txt run.mcap", 1),
-        "skinbus: words.txt: there is no frame in 3 lines; expected the output of candump, with \
+        "skinbus: words.txt: no frame in 3 lines; expected the output of candump, with \
          lines like `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`"
     );
     assert!(folder.refuses("convert run.pcapng run.mcap", 2).contains("is a packet capture"));
@@ -183,13 +180,10 @@ fn what_is_no_capture_is_refused_by_its_name() {
             "{said}"
         );
     }
-    assert_eq!(
-        folder.refuses("convert empty.mcap run.log", 1),
-        "skinbus: empty.mcap: there is no frame in it"
-    );
+    assert_eq!(folder.refuses("convert empty.mcap run.log", 1), "skinbus: empty.mcap: it contains no frame");
     let gone = folder.refuses("convert gone.log run.mcap", 2);
     assert_eq!(gone, "skinbus: gone.log: No such file or directory (os error 2)");
-    assert_eq!(folder.refuses("convert . run.mcap", 2), "skinbus: .: it is a folder, a file is needed");
+    assert_eq!(folder.refuses("convert . run.mcap", 2), "skinbus: .: it is a folder, but a file is needed");
     let nowhere = "No such file or directory (os error 2); name a file in a folder that can be written";
     let said = folder.refuses("convert words.txt none/run.mcap", 2);
     assert_eq!(said, format!("skinbus: none/run.mcap: {nowhere}"));
@@ -201,11 +195,11 @@ fn a_bad_line_is_named_and_kept_and_with_strict_it_is_the_end() {
     let folder = Folder::new(&[("run.log", log.as_bytes())]);
     assert_eq!(
         folder.refuses("convert run.log run.mcap --strict", 1),
-        "skinbus: run.log:2: column 4: digits of a second; without --strict, the line would be kept as it is"
+        "skinbus: run.log:2: column 4: expected digits of a second; without --strict, the line would be kept as it is"
     );
     assert_eq!(
         folder.says("convert run.log run.mcap", 0),
-        "run.log:2: column 4: digits of a second\n\
+        "run.log:2: column 4: expected digits of a second\n\
          run.log: 1 line begins like a frame but is not one: not read\n\
          run.log -> run.mcap: 2 frames, 1 notes\n"
     );

@@ -66,7 +66,10 @@ fn rates_are_those_of_the_command_line_or_of_the_description_or_common_ones() {
         assert_eq!(names(&json(&format!("fit {arguments} --json")), "table"), all);
     }
     let said = |name: &str| String::from_utf8(gateway(&format!("fit {}", path(name))).stderr).unwrap();
-    assert_eq!(said("mixed"), "no bitrate of vcan0: these are common bit rates, not those of ur5-90\n");
+    assert_eq!(
+        said("mixed"),
+        "the skin ur5-90 gives no bitrate for vcan0, so the table lists common bit rates\n"
+    );
     assert_eq!(said("plain") + &said("rates"), "");
     let only = json(&format!("fit {} --format classic --json", path("plain")));
     assert_eq!(names(&only, "table"), all[..2]);
@@ -103,7 +106,7 @@ fn what_can_does_not_allow_is_refused_in_one_line() {
         assert!(refusal(&format!("fit {skin} {arguments}")).ends_with("try '--help'"));
     }
     let alone = refusal(&format!("fit {skin} --data 5M"));
-    assert_eq!(alone, "skinbus: --data for a skin also needs --nominal");
+    assert_eq!(alone, "skinbus: --data needs --nominal if a skin is given: add --nominal");
     assert!(refusal("fit nothing.toml").contains("nothing.toml"));
     for option in ["--rates vcan0=1M/5M", "--skin x.toml", "--bench-traffic", "--ber 0.001", "--duration 3"] {
         let (name, file) = (option.split(' ').next().unwrap(), skin);

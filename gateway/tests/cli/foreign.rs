@@ -283,6 +283,11 @@ fn dump_shows_a_foreign_log_as_foreign_in_its_order() {
     );
     let table = gateway(folder, "dump car.log --stats");
     assert!(table.lines().all(|line| line.chars().count() <= 80), "{table}");
+    // Each value ends below its heading.
+    let line_with = |text: &str| table.lines().find(|line| line.contains(text)).unwrap();
+    let (heads, first) = (line_with("can0 foreign"), line_with(" 001 "));
+    let ends = |line: &str, text: &str| line.split_once(text).unwrap().0.chars().count() + text.len();
+    assert_eq!(ends(first, "   8 "), ends(heads, "bytes "), "{table}");
     for id in ["20C", "0CF00400", "20000004", "701"] {
         assert!(
             table.lines().any(|line| line.trim_start_matches(['│', ' ']).starts_with(id)),

@@ -65,7 +65,7 @@ fn a_recording_without_a_skin_is_refused() {
     std::fs::write(folder.path().join("run.log"), "(1.000000) vcan0 123#00\n").unwrap();
     assert!(gateway(folder.path(), "convert run.log run.mcap").status.success());
     let said = refusal(folder.path(), "skin dbc run.mcap", 2);
-    assert_eq!(said, "skinbus: run.mcap contains no skin: name the skin's own file");
+    assert_eq!(said, "skinbus: run.mcap contains no skin: name a skin file");
 }
 
 #[test]
@@ -170,7 +170,7 @@ fn with_strict_the_first_line_that_cannot_be_read_is_the_end() {
     let log = "(1.000000) vcan0 002##50000000000000000000000000000632A\n(1.000000) vcan0 12#11\n(1.0) x\n";
     std::fs::write(folder.join("odd.log"), log).unwrap();
     let Output { status, stderr, .. } = gateway(folder, "convert odd.log even.log --strict");
-    let said = "skinbus: odd.log:2: column 18: an identifier of 3 or 8 hexadecimal digits";
+    let said = "skinbus: odd.log:2: column 18: expected an identifier of 3 or 8 hexadecimal digits";
     assert_eq!(status.code(), Some(1));
     assert!(std::str::from_utf8(&stderr).unwrap().starts_with(said), "{stderr:?}");
     assert!(!folder.join("even.log").exists());
@@ -259,7 +259,7 @@ fn the_worked_example_of_the_document_is_explained_in_a_terminal() {
         "  F_z        1.0000 F_c + 0.0000 F_p = 3.000000 N, not below 0.1006 N",
         "  in words   196608 steps of 2^-16 N = 3.000000 N",
         "  answered   0.500 ms after the joints",
-        "  vcan0 12: it did not report its configuration, which is assumed to be the skin's, 266D",
+        "  vcan0 12: it did not report its configuration hash, which is assumed to be that of the skin, 266D",
         "  vcan0: 1 cells sent nothing, and their contact state is not in the capture; they are assumed not to be in contact",
     ] {
         assert!(text.lines().any(|there| there == line), "{line}\n{text}");
@@ -297,13 +297,13 @@ fn what_cannot_be_explained_is_one_line() {
         (
             "explain run.log --skin skin.toml --epoch 8",
             1,
-            "run.log: the capture has no joints message of epoch 8; it has one of epoch 7 at 0.200 s",
+            "run.log: the capture contains no joints message of epoch 8; it contains one of epoch 7 at 0.200 s",
         ),
         (
             "explain run.log --skin skin.toml --epoch 7 --at 0.3 --occurrence 2",
             1,
-            "run.log: the capture has no joints message of epoch 7 (occurrence 2) at 0.300 s or later; it has one of epoch 7 at \
-             0.200 s",
+            "run.log: the capture contains no joints message of epoch 7 (occurrence 2) at 0.300 s or later; it \
+             contains one of epoch 7 at 0.200 s",
         ),
         (
             "explain run.log --skin skin.toml --epoch 7 --cell 99",
@@ -323,7 +323,7 @@ fn what_cannot_be_explained_is_one_line() {
         (
             "explain empty.log --skin skin.toml --epoch 7",
             1,
-            "empty.log: there is no frame in 1 line; expected the output of candump, with lines like \
+            "empty.log: no frame in 1 line; expected the output of candump, with lines like \
              `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`",
         ),
         (
@@ -359,9 +359,9 @@ fn a_hint_does_not_lead_to_the_next_refusal() {
     let folder = folder.path();
     std::fs::write(folder.join("words.txt"), "nothing\n").unwrap();
     // No skin, sensing mode or option would help here.
-    let description = "skinbus: skin.toml is a skin or a scenario, not a candump log or MCAP recording: there are no frames in \
-                       it: name a capture";
-    let nothing = "skinbus: words.txt: there is no frame in 1 line; ";
+    let description = "skinbus: skin.toml is a skin or a scenario, not a candump log or MCAP recording: it contains \
+                       no frames: name a capture";
+    let nothing = "skinbus: words.txt: no frame in 1 line; ";
     let read = "skinbus: --node-ids skin.toml is a file that this command reads: name another file";
     for (arguments, code, begin) in [
         ("calibrate skin.toml --recording skin.toml", 2, description),

@@ -89,17 +89,20 @@ fn another_skin_than_the_recorded_one_is_remarked() {
     let own = String::from_utf8(own.clone()).unwrap();
     for command in ["dump fd.mcap --brief", "explain fd.mcap --epoch 9", "fit fd.mcap"] {
         let same = said(&own, command);
-        assert!(!same.contains("is not the skin"), "{command}: {same}");
+        assert!(!same.contains("differs from the skin recorded"), "{command}: {same}");
         let moved = own.replacen("position = [", "position = [0.001, ", 1);
         let start = moved.find("[0.001, ").unwrap() + 8;
         let end = start + moved.get(start..).unwrap().find(", ").unwrap() + 2;
         let moved = [moved.get(..start).unwrap(), moved.get(end..).unwrap()].concat();
         let parameters = said(&moved, command);
-        assert!(parameters.contains("was recorded with (parameters of cell"), "{command}: {parameters}");
+        assert!(parameters.contains("differs from the skin recorded in fd.mcap (parameters of cell 1 on vcan0: as described, recorded: different)"), "{command}: {parameters}");
         let without_wires = |line: &&str| !line.starts_with("neighbors") && !line.starts_with("root");
         let cells = own.rsplit_once("[[cell]]").unwrap().0.lines().filter(without_wires);
         let cells: String = cells.map(|line| format!("{line}\n")).collect();
         let fewer = said(&cells, command);
-        assert!(fewer.contains("was recorded with (cells: 2, recorded: 3)"), "{command}: {fewer}");
+        assert!(
+            fewer.contains("differs from the skin recorded in fd.mcap (cells: 2, recorded: 3)"),
+            "{command}: {fewer}"
+        );
     }
 }

@@ -459,6 +459,6 @@ fn the_command_says_what_it_did_and_overwrites_nothing() {
     assert_eq!(says("recover run.mcap.part -o none/new.mcap", 2), nowhere);
     let held = fs::File::open(path("run.mcap.part")).unwrap();
     rustix::fs::flock(&held, rustix::fs::FlockOperation::LockExclusive).unwrap();
-    let recorded = "skinbus: run.mcap.part is being recorded: wait for the run's end";
+    let recorded = "skinbus: run.mcap.part is still being recorded: wait until the run ends";
     assert_eq!(says("recover run.mcap.part", 2), recorded);
 }

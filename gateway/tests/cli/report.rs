@@ -61,8 +61,8 @@ fn what_is_no_recording_of_a_run_is_refused_in_one_line_and_nothing_is_written()
     );
     assert_eq!(
         refuses(&folder, "run.log", 2),
-        "run.log is a log, which has only frames: name their skin with --skin, or record with `skinbus run SKIN \
-         --record run.mcap`, which keeps the skin"
+        "run.log is a candump log, which contains only frames: name the skin with --skin, or make a recording, which \
+         contains the skin, with `skinbus run SKIN --record run.mcap`"
     );
     assert!(refuses(&folder, "picture.mcap", 2).contains("is a zip archive"));
     let mut damaged = fs::read(concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/recordings/fd.mcap")).unwrap();
@@ -138,18 +138,19 @@ fn a_log_gives_the_accounts_of_the_recording_of_the_same_run_and_names_what_it_l
     let lacks =
         "joint velocities; ticks and cycle times; the scenario; the command, program and machine of the run";
     let (of_log, said) = page(&folder, "classic.log --skin classic.toml");
-    assert_eq!(said, format!("skinbus: classic.log: not in a log: {lacks}\n"));
+    assert_eq!(said, format!("skinbus: classic.log: the capture does not contain: {lacks}\n"));
     assert_eq!(names(folder.path()), before, "-o - writes no file");
-    for title in ["Absolute errors, joint by joint", "Torque formats: "] {
+    for title in ["Absolute torque errors by joint", "Torque formats: "] {
         assert_eq!(table(&of_log, title), table(&of_run, title));
     }
     let replies = |page: &str| row(table(page, "Replies by bus"), "vcan0")[..7].join(" ");
     assert_eq!(replies(&of_log), replies(&of_run));
     for text in [
-        format!("Not in a log: {lacks}."),
-        "Not in a log: joint velocities, because joints frames contain only positions.".to_owned(),
-        "Not in a log: the durations of ticks and of the central computation".to_owned(),
-        "Not in a log: skipped ticks and bad cycles.".to_owned(),
+        format!("This capture does not contain: {lacks}."),
+        "This capture does not contain joint velocities, because joints frames contain only positions."
+            .to_owned(),
+        "This capture does not contain the durations of ticks and of the central computation".to_owned(),
+        "This capture does not contain the counts of skipped ticks and bad cycles.".to_owned(),
         "skinbus view classic.log --skin classic.toml --at ".to_owned(),
     ] {
         assert!(of_log.contains(&text), "{text}");
@@ -175,11 +176,12 @@ fn a_log_gives_the_accounts_of_the_recording_of_the_same_run_and_names_what_it_l
 
     assert!(gateway(folder.path(), "convert classic.log foreign.mcap").status.success());
     let (foreign, said) = page(&folder, "foreign.mcap --skin classic.toml");
-    assert_eq!(said, format!("skinbus: foreign.mcap: not in frames alone: {lacks}\n"));
+    assert_eq!(said, format!("skinbus: foreign.mcap: the capture does not contain: {lacks}\n"));
     assert_eq!(replies(&foreign), replies(&of_log));
     let (sums, said) = page(&folder, "sums.log --skin sums.toml");
     assert!(
-        said.contains(": not in a log: joint velocities; ") && sums.contains("id=\"positions\""),
+        said.contains("the capture does not contain: joint velocities; ")
+            && sums.contains("id=\"positions\""),
         "{said}"
     );
 }
@@ -195,11 +197,12 @@ fn a_log_without_stimuli_does_not_say_that_nothing_was_touched() {
         log.lines().filter(|line| !is_stimulus(line)).map(|line| format!("{line}\n")).collect();
     fs::write(folder.path().join("rest.log"), rest).unwrap();
     let (page, said) = page(&folder, "rest.log --skin classic.toml");
-    assert!(said.contains("not in a log: stimuli or sensors, and with them central torques; "), "{said}");
+    assert!(said.contains("does not contain: stimuli or sensors, and so no central torques; "), "{said}");
     for text in [
-        "Not in a log: stimuli or sensors of the cells that sent torques, and so the forces on them.",
-        "Not in a log: stimuli or sensors from which central torques, and the difference to them, follow.",
-        "Not in a log: stimuli or sensors of all cells, and so which are in contact.",
+        "This capture does not contain the stimuli or sensors of the cells that sent torques, which show the forces \
+         on them.",
+        "This capture does not contain the stimuli or sensors from which central torques are computed.",
+        "This capture does not contain the stimuli or sensors of all cells, which show which cells are in contact.",
     ] {
         assert!(page.contains(text), "{text}");
     }
@@ -222,9 +225,9 @@ fn a_log_of_something_else_and_another_skin_than_the_recorded_one_are_refused() 
         ),
         (
             "untimed.log",
-            "untimed.log has lines without times: a report needs them, as `candump -L` writes them",
+            "untimed.log has lines without time stamps, which a report needs: make the log with `candump -L`",
         ),
-        ("words.log", "words.log has no frame in it: a log is what `candump -L` writes"),
+        ("words.log", "words.log contains no frame: expected a log as `candump -L` writes it"),
         (
             "empty.log",
             "empty.log contains no run: it is empty; record one with `skinbus run SKIN --record run.mcap`",
@@ -232,8 +235,8 @@ fn a_log_of_something_else_and_another_skin_than_the_recorded_one_are_refused() 
         ("nowhere.log", "nowhere.log: "),
         (
             "fd.mcap",
-            "fd.mcap was recorded with another skin than sums.toml (cells: 5, recorded: 3); leave --skin out: the recording contains \
-             its skin",
+            "fd.mcap was recorded with a skin that differs from sums.toml (cells: 5, recorded: 3); leave --skin out: \
+             the recording contains its skin",
         ),
     ] {
         let refused = refuses(&folder, &format!("{arguments} --skin sums.toml -o out.html"), 2);

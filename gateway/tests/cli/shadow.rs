@@ -107,17 +107,17 @@ fn what_has_no_frame_and_what_is_no_capture_is_said_in_one_line() {
     }
     fs::write(folder.path().join("run.log"), log()).unwrap();
     for (arguments, code, begin) in [
-        ("fit empty.log", 1, "skinbus: empty.log: it is empty: there is no frame in it"),
-        (
-            "fit notes.txt",
-            1,
-            "skinbus: notes.txt: there is no frame in 1 line; expected the output of candump",
-        ),
+        ("fit empty.log", 1, "skinbus: empty.log: the file is empty"),
+        ("fit notes.txt", 1, "skinbus: notes.txt: no frame in 1 line; expected the output of candump"),
         ("fit x.zip", 2, "skinbus: x.zip is "),
         ("fit .", 2, "skinbus: . is a directory"),
-        ("fit nowhere", 2, "skinbus: there is no file nowhere, and it does not open as a bus: "),
+        ("fit nowhere", 2, "skinbus: there is no file nowhere, and opening it as a bus failed: "),
         ("fit run.log notes.txt", 2, "skinbus: notes.txt contains no frames: name only captures"),
-        ("fit run.log vcan0", 2, "skinbus: run.log, vcan0: name one file, the parts of one recording"),
+        (
+            "fit run.log vcan0",
+            2,
+            "skinbus: run.log, vcan0: files and buses cannot be mixed: name one file, the parts of one recording",
+        ),
         ("fit run.log --duration 3", 2, "skinbus: --duration is only for live buses"),
         ("fit run.log --nominal 2M", 2, "skinbus: nominal bit rate 2000000 bit/s: CAN allows"),
         ("fit run.log --data 9M", 2, "skinbus: data bit rate 9000000 bit/s: CAN FD allows"),

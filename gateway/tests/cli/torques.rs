@@ -143,7 +143,7 @@ fn torques_that_come_in_sums_are_empty_and_the_central_ones_are_there() {
     let said = String::from_utf8(stderr).unwrap();
     assert_eq!(status.code(), Some(0), "{said}");
     assert!(
-        said.contains("sums.mcap: vcan0 answers with sums: distributed torques and errors are empty"),
+        said.contains("the cells on vcan0 answer with sums: distributed torques and errors are empty"),
         "{said}"
     );
     let rows = rows(&folder, "sums.csv");
@@ -163,7 +163,8 @@ fn what_has_no_torques_is_refused_in_one_line_and_nothing_is_written() {
         (
             "foreign.log out.csv --skin fd.toml",
             1,
-            "skinbus: foreign.log: the skin has none of the capture's buses (can7); it has vcan0",
+            "skinbus: foreign.log: the skin has none of the capture's buses (can7), only vcan0: name the skin of \
+             this capture",
         ),
         ("- out.csv", 2, "skinbus: standard input can be read only once: name the skin with --skin"),
         (

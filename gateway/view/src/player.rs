@@ -100,7 +100,7 @@ pub enum PlayError {
     #[error("{0}")]
     Damaged(String),
     /// The recording has no frames.
-    #[error("{0}: there is no frame in it")]
+    #[error("{0}: the recording contains no frames")]
     Empty(String),
 }
 

@@ -29,7 +29,7 @@ export function colourOf(shows, cell, at) {
 // The meanings of a cell's shape, the most important first; `shape` is the number in the shader.
 export const SHAPES = [
   { shape: 1, is: (cell) => cell.status === 4, name: "silent", mark: "cross" },
-  { shape: 2, is: (cell) => cell.status === 0, name: "never heard", mark: "ring" },
+  { shape: 2, is: (cell) => cell.status === 0, name: "no frame received", mark: "ring" },
   { shape: 3, is: (cell) => (cell.flags & 1) !== 0, name: "no parameters", mark: "hole" },
   { shape: 4, is: (cell) => (cell.flags & 2) !== 0, name: "different parameters", mark: "half" },
   { shape: 5, is: (cell) => cell.status === 3, name: "stale: no reply", mark: "bar" },

@@ -3,7 +3,9 @@
 import { element, show } from "./dom.js";
 import { number } from "./plots.js";
 
-const VERDICTS = { nearest: "nearest", saturated: "saturated", rounded: "16-bit J", unexplained: "no J near", open: "not known" };
+const VERDICTS = {
+  nearest: "nearest word", saturated: "saturated", rounded: "rounded J", unexplained: "not explained", open: "unknown",
+};
 
 const $ = (id) => document.getElementById(id);
 // The server keeps frames for 3 s. A list under the pointer is renewed only after this time, which is shorter.
@@ -63,7 +65,7 @@ function rowOf(frame, key, ask) {
   if (!frame.is_torque) return row;
   const button = element("button", "Why");
   button.type = "button";
-  button.setAttribute("aria-label", `Why the torque at ${frame.at_s.toFixed(4)} s is so`);
+  button.setAttribute("aria-label", `Explain the torque at ${frame.at_s.toFixed(4)} s`);
   button.onclick = () => {
     asked = sought = frame.number;
     hold(true);
@@ -86,14 +88,14 @@ function table(head, rows) {
 }
 
 function explain(why) {
-  const parts = [element("h3", `Why, epoch ${why.epoch}`)], cell = why.cell, force = cell?.force;
+  const parts = [element("h3", `Explanation, epoch ${why.epoch}`)], cell = why.cell, force = cell?.force;
   if (force) {
     parts.push(element("p", `Contact ${force.contact_n.map((v) => v.toFixed(4)).join(" + ")} = ${force.touch_n.toFixed(4)} N`),
       element("p", `Force ${force.alpha_c} × ${force.touch_n.toFixed(4)} N + ${force.alpha_p_n} N × ${force.proximity.toFixed(4)} = ${force.fused_n.toFixed(4)} N; in steps of 2⁻¹⁶ N: ${force.force_steps}`));
   }
   if (cell) {
     const value = (v) => (v === null || v === undefined ? "–" : number(v));
-    parts.push(table(["Joint", "J, m", "J F", "step", "word", ""], cell.rows.map((row) => [
+    parts.push(table(["Joint", "J, m", "J F", "expected word", "sent word", "explanation"], cell.rows.map((row) => [
       String(row.joint), value(row.jacobian_m), `${value(row.product_nm)} ${row.unit}`, String(row.nearest_word ?? "–"),
       String(row.word ?? "–"), VERDICTS[row.verdict.is],
     ])));
@@ -105,7 +107,7 @@ function explain(why) {
 }
 
 function giveUp() {
-  const words = "No answer: frames are kept for 3 s, and this one may be older. Choose a newer one.";
+  const words = "No answer: the server keeps frames for 3 s, and this frame may be older. Choose a newer frame.";
   $("why").replaceChildren(element("p", words, "faint"));
   $("why").scrollIntoView({ block: "nearest" });
   hold(false);

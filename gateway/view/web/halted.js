@@ -3,7 +3,7 @@
 export function haltedWords(said, mayPress) {
   const run = said.bench;
   if (!said.halted && !run?.halted) return "";
-  const why = run?.halted ? `The robot is halted: ${run.halted}.` : "The robot is halted by a Halt on the bus.";
+  const why = run?.halted ? `The robot is halted: ${run.halted}.` : "The robot is halted by a halt frame on the bus.";
   if (!mayPress) return why;
   return run?.buses.some(({ down }) => down) ? `${why} Bring the bus up, then press Resume.` : `${why} Press Resume to continue.`;
 }

@@ -40,7 +40,7 @@ export class Plots {
       const ratio = Math.min(2, window.devicePixelRatio || 1), [w, h] = [canvas.clientWidth, canvas.clientHeight];
       if (!points.length || !w) continue;
       const [time, now, exact] = points[points.length - 1];
-      value.textContent = `${number(now)} ${unit}, off ${number(now - exact)}`;
+      value.textContent = `${number(now)} ${unit}, error ${number(now - exact)}`;
       if (canvas.width !== Math.round(w * ratio)) { canvas.width = Math.round(w * ratio); canvas.height = Math.round(h * ratio); }
       // In memory: the processor draws small lines sooner than WebGL in software.
       const pen = canvas.getContext("2d", { willReadFrequently: true });

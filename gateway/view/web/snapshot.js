@@ -2,7 +2,7 @@
 
 export function decode(buffer) {
   const data = new DataView(buffer), joints = data.getUint32(4, true), cells = data.getUint32(8, true);
-  if (buffer.byteLength !== 24 + 12 * joints + 8 * cells) throw new Error("a snapshot of another length");
+  if (buffer.byteLength !== 24 + 12 * joints + 8 * cells) throw new Error("the snapshot has a wrong length");
   const snapshot = { number: data.getUint32(0, true), time: data.getFloat64(16, true), joints: [], cells: new Uint32Array(buffer, 24 + 12 * joints, 2 * cells) };
   for (let j = 0; j < joints; j++) {
     const [position, distributed, central] = [0, 4, 8].map((at) => data.getFloat32(24 + 12 * j + at, true));
@@ -14,7 +14,7 @@ export function decode(buffer) {
 // The torques before the position of a seek.
 export function decodeHistory(buffer) {
   const data = new DataView(buffer), joints = data.getUint32(4, true), moments = data.getUint32(8, true);
-  if (buffer.byteLength !== 16 + moments * (8 + 8 * joints)) throw new Error("a history of another length");
+  if (buffer.byteLength !== 16 + moments * (8 + 8 * joints)) throw new Error("the history has a wrong length");
   const all = [];
   for (let i = 0, at = 16; i < moments; i++, at += 8 + 8 * joints) {
     const torques = [];

@@ -142,7 +142,7 @@ $("buses").replaceChildren(...scene.buses.map((bus, index) => {
   return item;
 }));
 const marks = [{ name: "root", mark: "root" }, { name: "other cell", mark: "" }];
-if (moved.length) marks.push({ name: "moved from its described place", mark: "way" });
+if (moved.length) marks.push({ name: "moved from its place in the skin", mark: "way" });
 shapes($("shapes"), css, marks);
 matchMedia("(prefers-color-scheme: dark)").onchange = () => { picture?.colours(); shapes($("shapes"), css, marks); redraw(); };
 follow();

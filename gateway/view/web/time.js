@@ -114,7 +114,7 @@ export class TimeBar {
     this.slider.setAttribute("aria-valuetext", this.at.textContent);
     this.state.className = failed ? "bad" : "faint";
     this.state.textContent = failed ?? (read < 1 ? `${Math.floor(read * 100)} % read${exact ? "" : "; counts cover the last seconds only"}`
-      : unfinished ?? (others ? `${others} frames on buses that the skin does not have` : ""));
+      : unfinished ?? (others ? `the recording has ${others} frames on buses that the skin does not have` : ""));
   }
 
   // Draws the events, one row for each kind.

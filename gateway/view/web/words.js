@@ -9,6 +9,8 @@ import { number } from "./plots.js";
 
 // With more buses than this, one table has a row for each.
 const FEW_BUSES = 3;
+// Texts for statuses whose names in summaries are not used on the page.
+const STATUSES = { "never heard": "no frame received" };
 const $ = (id) => document.getElementById(id);
 
 function facts(pairs) {
@@ -24,7 +26,7 @@ const percent = (share) => (share === null || share === undefined ? "–" : `${(
 // One row for each bus.
 function many(buses) {
   const it = element("table"), head = element("tr");
-  for (const text of ["Bus", "Load", "Late, missing", "Lost, damaged"]) {
+  for (const text of ["Bus", "Load", "Replies late, missing", "Packets lost, damaged"]) {
     const cell = element("th", text);
     cell.scope = "col";
     head.append(cell);
@@ -58,13 +60,13 @@ export function say(scene, said, ask) {
   show($("buses"), said.buses.length > FEW_BUSES ? [many(said.buses)] : said.buses.flatMap((bus) => [
     element("h3", bus.up ? bus.name : `${bus.name}: down`, bus.up ? "" : "bad"),
     table([
-      ["Real bus load", percent(bus.load), bus.load > 1 ? "bad" : ""],
+      ["Load on a real bus", percent(bus.load), bus.load > 1 ? "bad" : ""],
       ["Replies in time", `${bus.in_time} of ${bus.due}`],
-      ["Late, missing", `${bus.late}, ${bus.missing}`, bus.late + bus.missing ? "bad" : ""],
+      ["Replies late, missing", `${bus.late}, ${bus.missing}`, bus.late + bus.missing ? "bad" : ""],
       ["Packets lost, damaged", `${bus.lost}, ${bus.rejected}`, bus.lost + bus.rejected ? "bad" : ""],
       ["Saturated torques", String(bus.saturated), bus.saturated ? "bad" : ""],
       ["Mean error", bus.error_nm === null ? "–" : `${bus.error_nm.toExponential(1)} Nm`],
-      ...(bus.dropped ? [["Frames not received here", String(bus.dropped), "bad"]] : []),
+      ...(bus.dropped ? [["Frames not read in time", String(bus.dropped), "bad"]] : []),
     ]),
   ]));
   show($("dead"), [said.dead_cells.length
@@ -79,7 +81,7 @@ function where(scene, { bus, node }) {
   if (!cell) return [];
   const three = (values, digits) => values.map((v) => v.toFixed(digits).replace("-", "−")).join(", ");
   return [
-    ["Row, joint", `${cell.row}, ${cell.joint}`],
+    ["DH row, joint", `${cell.row}, ${cell.joint}`],
     ["Position, mm", three(cell.position.map((v) => v * 1000), 1)],
     ["Normal", three(cell.normal, 3)],
   ];
@@ -95,12 +97,13 @@ function detail(scene, it, ask) {
   const joints = scene.chains[scene.buses[it.bus].chain].rows.filter((row) => row.joint !== null).map((row) => scene.joints[row.joint]);
   const wrong = it.configuration[0] !== null && it.configuration[0] !== it.configuration[1];
   const rows = [
-    ["Status", it.status, it.status === "dead" || it.status === "stale" ? "bad" : ""],
+    ["Status", STATUSES[it.status] ?? it.status, it.status === "dead" || it.status === "stale" ? "bad" : ""],
     ["Serial number", String(it.serial)],
     ...where(scene, it),
-    ["Configuration", wrong ? `${it.configuration[0]}, not ${it.configuration[1]}` : it.configuration[1], wrong ? "bad" : ""],
-    ["Gains α", it.gains.alpha.map(String).join(", ") + " N"],
-    ["Thresholds", it.gains.thresholds.map((value, at) => `${Number(value.toPrecision(3))}${[" N", "", " N"][at]}`).join(", ")],
+    ["Configuration", wrong ? it.configuration.join(", expected ") : it.configuration[1], wrong ? "bad" : ""],
+    ["Gains α: contact, proximity", it.gains.alpha.map(String).join(", ") + " N"],
+    ["Thresholds: contact, proximity, force",
+      it.gains.thresholds.map((value, at) => `${Number(value.toPrecision(3))}${[" N", "", " N"][at]}`).join(", ")],
     ["Force", `${it.force_n.toFixed(3)} N`],
     ...it.readings.map(reading),
     ["Replies in time", `${it.replies[1]} of ${it.replies[0]}`],

@@ -16,11 +16,14 @@ use super::embedded::DirectoryError;
 pub enum BusError {
     /// The name is not valid for a bus.
     #[error(
-        "{0:?} is not a valid bus name: use 1 to 15 bytes without spaces, '/' or ':', except '.' and '..'"
+        "{0:?} is not a valid bus name: use 1 to 15 bytes without spaces, '/' or ':', and not '.' or '..'"
     )]
     Name(String),
     /// There are more filters than the kernel accepts.
-    #[error("{got} filters are too many for one socket on {name}: at most {max}", max = Filter::MAX_COUNT)]
+    #[error(
+        "{got} filters are too many for one socket on {name}: use at most {max}",
+        max = Filter::MAX_COUNT
+    )]
     Filters {
         /// The bus.
         name: String,
@@ -52,11 +55,11 @@ pub enum BusError {
     },
     /// The interface was down when it was opened, or went down later. It may come up again.
     #[error(
-        "{0} is down: bring it up with `ip link set {0} up`; if that is refused, `vcan-setup doctor {0}` says why"
+        "{0} is down: bring it up with `ip link set {0} up`; if that fails, `vcan-setup doctor {0}` shows why"
     )]
     Down(String),
     /// The interface was removed while it was in use.
-    #[error("{0} was removed while it was in use: make it again and open it again")]
+    #[error("{0} was removed while it was in use: create it again, then open it again")]
     Gone(String),
     /// The process lacks permission.
     #[error("not allowed to {doing} {name}: {source}")]
@@ -130,7 +133,8 @@ pub enum BusError {
     /// The server of the embedded bus has closed this connection, but still serves others. The bus must be
     /// opened again.
     #[error(
-        "the embedded bus {0} was closed: its server disconnected only this program and still serves others; attach again"
+        "the embedded bus {0} was closed: its server disconnected this program, but still serves others; \
+         connect again"
     )]
     HungUp(String),
     /// The transmit queue of the bus stayed full until the send timeout.

@@ -45,7 +45,10 @@ impl BusKind {
     #[must_use]
     pub fn help() -> String {
         let names = Self::names();
-        format!("{names}; auto is SocketCAN if there is an interface of this name, else the embedded bus")
+        format!(
+            "Bus kind: {names}; auto uses SocketCAN if an interface of this name exists, else the embedded \
+             bus"
+        )
     }
 
     /// Returns true for network interfaces of the kernel; buses of all other kinds are sockets that a process

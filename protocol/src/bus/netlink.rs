@@ -57,7 +57,7 @@ impl RtnetlinkSocket {
                 return Ok(answers);
             }
         }
-        Err(io::Error::other("the interfaces change faster than they can be read"))
+        Err(io::Error::other("the network interfaces changed during each attempt to read them: try again"))
     }
 
     fn query(&mut self, payload: RouteNetlinkMessage, flags: u16) -> io::Result<(Vec<Vec<u8>>, bool)> {

@@ -8,7 +8,7 @@ fn names_are_those_that_an_interface_can_have() {
     for name in ["", "a234567890123456", ".", "..", "a/b", "a b", "a:b"] {
         let error = check_name(name).unwrap_err().to_string();
         let rest =
-            "is not a valid bus name: use 1 to 15 bytes without spaces, '/' or ':', except '.' and '..'";
+            "is not a valid bus name: use 1 to 15 bytes without spaces, '/' or ':', and not '.' or '..'";
         assert_eq!(error, format!("{name:?} {rest}"));
     }
 }
@@ -54,7 +54,7 @@ fn a_kernel_without_can_says_so_and_one_with_it_names_the_missing_interface() {
 fn too_many_filters_are_refused_before_anything_is_opened() {
     let options = BusOptions { filters: vec![Filter::ALL; 513], ..BusOptions::default() };
     let error = Bus::open("vcan0", KindChoice::Auto, &options).unwrap_err();
-    assert_eq!(error.to_string(), "513 filters are too many for one socket on vcan0: at most 512");
+    assert_eq!(error.to_string(), "513 filters are too many for one socket on vcan0: use at most 512");
 }
 
 /// Returns an embedded bus without a server, and the server's end of its connection.

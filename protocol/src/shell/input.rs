@@ -55,7 +55,7 @@ pub fn open(path: &Path) -> io::Result<File> {
     // `open` fails for a socket too, but its error says only that there is no such device.
     let is_socket = fs::metadata(path).is_ok_and(|about| about.file_type().is_socket());
     if is_socket {
-        return Err(io::Error::other("it is a socket, a file is needed"));
+        return Err(io::Error::other("it is a socket, but a file is needed"));
     }
     let file = OpenOptions::new().read(true).custom_flags(flags).open(path)?;
     let kind = file.metadata()?.file_type();
@@ -68,11 +68,11 @@ pub fn open(path: &Path) -> io::Result<File> {
 
 fn not_readable_error(kind: FileType) -> io::Error {
     let what = if kind.is_dir() {
-        "it is a folder, a file is needed"
+        "it is a folder, but a file is needed"
     } else if kind.is_fifo() {
-        "it is a named pipe, a file is needed; a pipe is read as /dev/stdin (< PIPE)"
+        "it is a named pipe, but a file is needed; a pipe is read as /dev/stdin (< PIPE)"
     } else {
-        "it is a device, a file is needed"
+        "it is a device, but a file is needed"
     };
     io::Error::other(what)
 }
@@ -134,9 +134,9 @@ mod tests {
         std::os::unix::fs::symlink("pipe", &link).unwrap();
         assert!(error(&pipe).starts_with("it is a named pipe"));
         assert!(error(&link).starts_with("it is a named pipe"));
-        assert_eq!(error(&socket), "it is a socket, a file is needed");
-        assert_eq!(error(&folder), "it is a folder, a file is needed");
-        assert_eq!(error(Path::new("/dev/zero")), "it is a device, a file is needed");
+        assert_eq!(error(&socket), "it is a socket, but a file is needed");
+        assert_eq!(error(&folder), "it is a folder, but a file is needed");
+        assert_eq!(error(Path::new("/dev/zero")), "it is a device, but a file is needed");
         fs::remove_dir_all(&folder).unwrap();
     }
 

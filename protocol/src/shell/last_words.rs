@@ -97,7 +97,7 @@ mod tests {
             "cells 1 on vcan0 end: no",
             "cells 3 to 3 on vcan0 end: no",
             "cell 03 on vcan0 ends: no",
-            "flash of cell 3 (a b) is not used: the CRC of the image is wrong",
+            "flash of cell 3 (a b) is not used: the CRC of the flash image is wrong",
         ] {
             assert_eq!(ExitReason::parse(line), None, "{line}");
         }

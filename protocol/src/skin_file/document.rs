@@ -86,7 +86,7 @@ impl KeyPath {
         found.map(|&(_, meaning)| meaning).ok_or_else(|| {
             let mut words = words.iter().map(|(word, _)| format!("{word:?}")).collect::<Vec<_>>();
             let last = words.pop().unwrap_or_default();
-            self.fault(format_args!("{got:?}"), format_args!("{} or {last}", words.join(", ")))
+            self.fault(format_args!("{got:?}"), format_args!("must be {} or {last}", words.join(", ")))
         })
     }
 
@@ -102,7 +102,7 @@ impl KeyPath {
     ) -> Result<u32, DocumentFault> {
         u32::try_from(got).ok().filter(|value| range.contains(value)).ok_or_else(|| {
             let (min, max) = range.into_inner();
-            self.fault(got, format_args!("{min} to {max}{unit} are possible"))
+            self.fault(got, format_args!("must be {min} to {max}{unit}"))
         })
     }
 
@@ -111,7 +111,7 @@ impl KeyPath {
     /// # Errors
     /// Returns an error if the number is infinite or NaN.
     pub fn check_finite(&self, value: f64) -> Result<f64, DocumentFault> {
-        if value.is_finite() { Ok(value) } else { Err(self.fault(value, "a finite number is needed")) }
+        if value.is_finite() { Ok(value) } else { Err(self.fault(value, "must be a finite number")) }
     }
 
     /// Checks that a number is finite and above 0.
@@ -129,7 +129,7 @@ impl KeyPath {
     /// Returns an error if the number is outside the range of the word.
     pub fn to_fixed<const F: u32>(&self, value: f64, fit: RoundingFn<F>) -> Result<Q<F>, DocumentFault> {
         fit(value).map_err(|OutOfRange { min, bound, .. }| {
-            self.fault(value, format_args!("the range is [{min}, {bound})"))
+            self.fault(value, format_args!("must be in [{min}, {bound})"))
         })
     }
 
@@ -271,7 +271,7 @@ pub fn parse<Raw: DeserializeOwned, T>(
     let signs = text.bytes().filter(|byte| b"=.,[{".contains(byte)).count();
     if signs > MAX_PUNCTUATION_CHARS {
         let reason = format!(
-            "it has {signs} of the characters = . , [ {{, and at most {MAX_PUNCTUATION_CHARS} are allowed"
+            "it has {signs} of the characters = . , [ {{, but at most {MAX_PUNCTUATION_CHARS} are allowed"
         );
         return Err(DocumentError::Unreadable { path: path.to_owned(), reason });
     }

@@ -99,7 +99,7 @@ pub enum CandumpLine<'a> {
 
 /// The error for a line that begins like a frame but does not contain a valid one.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
-#[error("column {column}: {expected}")]
+#[error("column {column}: expected {expected}")]
 pub struct LineError {
     /// Column of the error, counted from 1.
     pub column: usize,
@@ -261,8 +261,8 @@ mod tests {
     fn bytes_need_not_be_text() {
         assert_eq!(parse_bytes(b"# \xFF"), Ok(CandumpLine::Other));
         let says = |line| parse_bytes(line).unwrap_err().to_string();
-        assert_eq!(says(b"(1.000000) c\xFFn 123#"), "column 12: the name of an interface");
-        assert_eq!(says(b"(1.000000) can0 123#\xFF"), "column 21: a space");
+        assert_eq!(says(b"(1.000000) c\xFFn 123#"), "column 12: expected the name of an interface");
+        assert_eq!(says(b"(1.000000) can0 123#\xFF"), "column 21: expected a space");
         assert!(matches!(parse_bytes("(1.000000) kän 123# \u{A0}".as_bytes()), Ok(CandumpLine::Frame(_))));
     }
 
@@ -337,20 +337,23 @@ mod tests {
     #[test]
     fn what_is_wrong_is_said_with_its_column() {
         let says = |line| parse(line).unwrap_err().to_string();
-        assert_eq!(says("(1.) can0 123#"), "column 4: digits of a second");
-        assert_eq!(says("(1.000000) can0 12#11"), "column 17: an identifier of 3 or 8 hexadecimal digits");
-        assert_eq!(says("(1.000000) can0 800#11"), "column 17: an 11-bit identifier, at most 7FF");
-        assert_eq!(says("(1.000000) can0 123#1"), "column 22: the second digit of a byte");
+        assert_eq!(says("(1.) can0 123#"), "column 4: expected digits of a second");
+        assert_eq!(
+            says("(1.000000) can0 12#11"),
+            "column 17: expected an identifier of 3 or 8 hexadecimal digits"
+        );
+        assert_eq!(says("(1.000000) can0 800#11"), "column 17: expected an 11-bit identifier, at most 7FF");
+        assert_eq!(says("(1.000000) can0 123#1"), "column 22: expected the second digit of a byte");
         assert_eq!(
             says("(1.000000) can0 123#112233445566778899"),
-            "column 39: at most 8 bytes in a classic frame"
+            "column 39: expected at most 8 bytes in a classic frame"
         );
         let further = "the end of the data: a byte follows a space";
-        assert_eq!(says("(1.000000) can0 123#11 22"), format!("column 24: {further}"));
+        assert_eq!(says("(1.000000) can0 123#11 22"), format!("column 24: expected {further}"));
         let remote = "no data, because the identifier has the flag of a remote frame";
-        assert_eq!(says("(1.000000) can0 C0000123#11"), format!("column 26: {remote}"));
-        assert_eq!(says("(1.000000) can0 123##"), "column 22: one digit of FD flags");
-        assert_eq!(says("(1.000000) "), "column 11: a space");
+        assert_eq!(says("(1.000000) can0 C0000123#11"), format!("column 26: expected {remote}"));
+        assert_eq!(says("(1.000000) can0 123##"), "column 22: expected one hexadecimal digit of FD flags");
+        assert_eq!(says("(1.000000) "), "column 11: expected a space");
     }
 
     proptest! {

@@ -128,7 +128,7 @@ impl TorqueFormat {
 
 /// The error for a real number outside the range of a `Q` format.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
-#[error("{got} is not in [{min}, {bound})")]
+#[error("{got} is outside the range [{min}, {bound})")]
 pub struct OutOfRange {
     /// The number that does not fit.
     pub got: f64,
@@ -380,7 +380,7 @@ mod tests {
     #[test]
     fn out_of_range_is_said_with_the_bounds() {
         let error = Q1_14::try_nearest(2.5).unwrap_err();
-        assert_eq!(error.to_string(), "2.5 is not in [-2, 2)");
+        assert_eq!(error.to_string(), "2.5 is outside the range [-2, 2)");
         assert!(Q1_14::try_nearest(1.999_99).is_err(), "rounds up to 2, which is out of range");
         assert!(Q1_14::try_nearest(f64::NAN).is_err());
         assert_eq!(Q3_12::nearest(9.0), Q3_12::MAX);

@@ -26,7 +26,7 @@ pub struct CellIdOutOfRange {
 
 /// The error for a text that is not the node id of a cell.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
-#[error("a node id is needed, 1 to 254")]
+#[error("it must be a node id, 1 to 254")]
 pub struct InvalidNodeId;
 
 impl CellId {

@@ -161,7 +161,7 @@ fn what_cannot_be_emulated_is_refused_in_one_line() {
     };
     says("--firmware nowhere.elf --emulate 8", "--firmware nowhere.elf: No such file");
     place.write("text", "no program");
-    says("--firmware text --emulate 8", "not an ELF file of a 32-bit ARM microcontroller");
+    says("--firmware text --emulate 8", "not an ELF file for a 32-bit Arm microcontroller");
     says(&format!("--firmware {elf} --emulate 77"), "--emulate 77: the skin has no such cell on vcan0");
     says(&format!("--firmware {elf} --emulate 8,3,8"), "--emulate 8 is given twice");
     says(&format!("--firmware {elf}"), "--emulate");
@@ -189,8 +189,7 @@ fn an_emulator_that_is_missing_or_ends_is_named_with_its_last_line() {
     let place = TestDir::new();
     place.pressed();
     let line = with_emulator(&place, None);
-    let missing =
-        "skinbus: qemu-system-arm is not in PATH, and --emulate needs it: apt-get install qemu-system-arm";
+    let missing = "skinbus: --emulate needs qemu-system-arm, which is not in PATH: run `apt-get install qemu-system-arm`";
     assert_eq!(line.refusal(2), missing);
     let ends = "#!/bin/sh\necho 'qemu-system-arm: unsupported machine type' >&2\nexit 1\n";
     let ended = with_emulator(&place, Some(ends));

@@ -188,10 +188,10 @@ fn a_connection_that_is_cut_is_made_again_and_each_missing_reply_explained() {
     let (_, bus) = pair.bench(|pair, bench| {
         bench.wait_for_stderr("host 'cells' of vcan0 is linked");
         pair.proxy.cut(true);
-        bench.wait_for_stderr("host 'cells' of vcan0 is gone, or not reached");
+        bench.wait_for_stderr("host 'cells' of vcan0 is gone or unreachable");
         bench.wait_for_stderr("fallen silent");
         pair.proxy.cut(false);
-        bench.wait_for_stderr("host 'cells' of vcan0 is reached again");
+        bench.wait_for_stderr("host 'cells' of vcan0 is reachable again");
         bench.wait_for_stderr("come back");
     });
     assert_eq!(bus["hosts"][0]["gone"], 1, "{bus:#}");
@@ -205,9 +205,9 @@ fn a_connection_that_falls_silent_is_noticed_and_made_again() {
     let (_, bus) = pair.bench(|pair, bench| {
         bench.wait_for_stderr("host 'cells' of vcan0 is linked");
         pair.proxy.stall(true);
-        bench.wait_for_stderr("host 'cells' of vcan0 is gone, or not reached");
+        bench.wait_for_stderr("host 'cells' of vcan0 is gone or unreachable");
         pair.proxy.stall(false);
-        bench.wait_for_stderr("host 'cells' of vcan0 is reached again");
+        bench.wait_for_stderr("host 'cells' of vcan0 is reachable again");
     });
     assert_eq!(bus["hosts"][0]["gone"], 1, "{bus:#}");
     pair.end();
@@ -220,11 +220,11 @@ fn links_that_are_killed_are_joined_again() {
     let (ended, bus) = pair.bench(|pair, bench| {
         bench.wait_for_stderr("host 'cells' of vcan0 is linked");
         pair.cells_link.signal(Signal::KILL);
-        bench.wait_for_stderr("host 'cells' of vcan0 is gone, or not reached");
+        bench.wait_for_stderr("host 'cells' of vcan0 is gone or unreachable");
         // A link that is back after 40 ms loses nothing visible.
         thread::sleep(Duration::from_secs(1));
         pair.cells_link = pair.cells.link(&format!("--connect tcp/127.0.0.1:{}", pair.proxy.port));
-        bench.wait_for_stderr("host 'cells' of vcan0 is reached again");
+        bench.wait_for_stderr("host 'cells' of vcan0 is reachable again");
     });
     assert_eq!(bus["hosts"][0]["gone"], 1, "{bus:#}");
     assert!(ended.stderr.contains("come back") || bus["uplink"]["outage"] != 0, "{bus:#}\n{}", ended.stderr);
@@ -241,7 +241,7 @@ fn the_link_of_the_gateways_host_may_be_killed() {
         pair.robot_link.signal(Signal::KILL);
         bench.wait_for_stderr("the link of vcan0 to other hosts has ended");
         pair.robot_link = pair.robot.link(&listen);
-        bench.wait_for_stderr("host 'cells' of vcan0 is reached again");
+        bench.wait_for_stderr("host 'cells' of vcan0 is reachable again");
     });
     assert_eq!(bus["hosts"][0]["gone"], 1, "{bus:#}");
     pair.end();
@@ -339,7 +339,7 @@ fn a_circle_that_something_else_makes_is_cut_and_said() {
     };
     until("the circle to be noticed", || {
         pass_on();
-        links.iter().any(|link| link.stderr().contains("come back from this bus")).then_some(())
+        links.iter().any(|link| link.stderr().contains("return from this bus")).then_some(())
     });
     for _ in 0..50 {
         pass_on();
@@ -375,9 +375,9 @@ fn two_network_namespaces_and_a_cable_that_is_pulled() {
     let bench = robot.bench();
     bench.wait_for_stderr("host 'cells' of vcan0 is linked");
     ip("-n robot link set cable down");
-    bench.wait_for_stderr("host 'cells' of vcan0 is gone, or not reached");
+    bench.wait_for_stderr("host 'cells' of vcan0 is gone or unreachable");
     ip("-n robot link set cable up");
-    bench.wait_for_stderr("host 'cells' of vcan0 is reached again");
+    bench.wait_for_stderr("host 'cells' of vcan0 is reachable again");
     bench.signal(Signal::TERM);
     bench.end().succeeded();
     let summary = robot.place.summary();
@@ -402,7 +402,7 @@ fn wrong_use_is_one_line() {
     };
     assert!(refused("").contains("no endpoint: give the address of another host"));
     assert!(refused("--listen udp/127.0.0.1:1").contains("an endpoint is tcp/HOST:PORT or tls/HOST:PORT"));
-    assert!(refused("--listen tcp/127.0.0.1:0 --host a/b").contains("it has one of"));
+    assert!(refused("--listen tcp/127.0.0.1:0 --host a/b").contains("it contains one of"));
     let _link = host.link("--listen tcp/127.0.0.1:0");
     assert!(refused("--listen tcp/127.0.0.1:0").contains("already linked by another process"));
 }

@@ -71,7 +71,7 @@ fn bit_rates_are_checked_and_set_only_on_request() {
     let named = bench.run("up can0");
     assert!(
         named.0 == 2
-            && named.2.starts_with("can0 is CAN hardware (kvaser_pci), which vcan-setup leaves alone"),
+            && named.2.starts_with("can0 is CAN hardware (kvaser_pci), which vcan-setup does not change"),
         "{named:?}"
     );
     assert_eq!(bench.run("down can0").0, 2);
@@ -83,7 +83,7 @@ fn bit_rates_are_checked_and_set_only_on_request() {
     assert_eq!(said, (0, "can0 is at 1000 kbit/s, and up\n".to_owned(), String::new()));
     assert_eq!(can0(), (true, 1_000_000.into()));
     let unchanged =
-        "can0 is CAN hardware (kvaser_pci), at 1000 kbit/s, as the skin requires, and is left as it is\n";
+        "can0 is CAN hardware (kvaser_pci), runs at 1000 kbit/s, as the skin requires, and stays unchanged\n";
     for again in ["up skin.toml --set-bit-rates", "up skin.toml"] {
         assert_eq!(bench.run(again), (0, unchanged.to_owned(), String::new()));
     }
@@ -109,8 +109,7 @@ fn what_the_hardware_cannot_do_leaves_it_as_it_was() {
 
     bench.write("format = \"fd\"\nbitrate = 500000\ndata_bitrate = 2000000");
     let (code, out, err) = bench.run("up skin.toml --set-bit-rates");
-    let expected = "cannot set can0 to 500 kbit/s, data 2000 kbit/s: this hardware has no CAN FD; give the bus \
-                    format = \"classic\", without data_bitrate";
+    let expected = "cannot set can0 to 500 kbit/s, data 2000 kbit/s: this hardware has no CAN FD; in the skin, set format = \"classic\" for the bus and remove data_bitrate";
     assert_eq!((code, out.as_str(), err.as_str()), (1, "", expected));
     assert_eq!(can0(), before);
 
@@ -118,7 +117,7 @@ fn what_the_hardware_cannot_do_leaves_it_as_it_was() {
     bench.write("format = \"classic\"\nbitrate = 930000");
     let (code, _, err) = bench.run("up skin.toml --set-bit-rates");
     assert!(code == 1 && err.starts_with("cannot set can0 to 930 kbit/s: "), "{err}");
-    assert!(err.contains("the nearest that its clock allows is 888888 bit/s"), "{err}");
+    assert!(err.contains("the nearest bit rates that its clock allows are 888888 bit/s"), "{err}");
     assert_eq!(can0(), before);
 }
 
@@ -131,7 +130,7 @@ fn the_doctor_knows_what_is_wrong_with_hardware() {
     let doctor = || bench.run("doctor skin.toml --no-spawn").1;
     assert!(doctor().contains("ok    can0 is at 500 kbit/s, as the skin says\n"), "{}", doctor());
     ip("link set can0 down");
-    assert!(doctor().contains("fault can0 is CAN hardware (kvaser_pci), and down\n"), "{}", doctor());
+    assert!(doctor().contains("fault can0 is CAN hardware (kvaser_pci), but down\n"), "{}", doctor());
     ip("link set can0 up type can listen-only on");
     assert!(doctor().contains("fault can0 only listens"), "{}", doctor());
     ip("link set can0 down");

@@ -86,28 +86,30 @@ fn wrong_use_is_said_in_one_line() {
             "up vcan0 --namespace x",
             "the following required arguments were not provided: --peer <PEER>; try '--help'",
         ),
-        ("up vcan0 vcan1 --peer x", "--peer makes one pair: give one NAME with it"),
+        ("up vcan0 vcan1 --peer x", "--peer makes one pair of interfaces: give exactly one NAME"),
         (
             "up lo",
-            "lo is the loopback interface, which vcan-setup leaves alone: choose another name, as in `vcan-setup up vcan0`",
+            "lo is the loopback interface, which vcan-setup does not change: choose another name, as in \
+             `vcan-setup up vcan0`",
         ),
-        ("down lo", "lo is the loopback interface that vcan-setup has not made, and is left alone"),
+        ("down lo", "lo is the loopback interface that vcan-setup did not make, so it stays unchanged"),
         (
             "up a23456789012345678",
             "\"a23456789012345678\" is not a valid bus name: use 1 to 15 bytes without spaces, '/' or ':', \
-             except '.' and '..'",
+             and not '.' or '..'",
         ),
         (
             "up vcan%d",
-            "\"vcan%d\" is not allowed as a name of an interface: use letters, digits, '-', '_' and '.', as in vcan0",
+            "\"vcan%d\" is not a valid name of an interface: use letters, digits, '-', '_' and '.', as in \
+             vcan0",
         ),
         (
             "up vcan0 --peer .x",
-            "\".x\" is not allowed as a name of an interface: use letters, digits, '-', '_' and '.', as in vcan0",
+            "\".x\" is not a valid name of an interface: use letters, digits, '-', '_' and '.', as in vcan0",
         ),
         ("up nosuch.toml", "nosuch.toml: No such file or directory (os error 2)"),
         ("status ./broken.toml", "./broken.toml:1:1: key `robot` is missing"),
-        ("doctor rates.toml", "rates.toml:36:11: bus[0].bitrate = 5: 10000 to 1000000 bit/s are possible"),
+        ("doctor rates.toml", "rates.toml:36:11: bus[0].bitrate = 5: must be 10000 to 1000000 bit/s"),
         (
             "doctor --bus-kind vcan",
             "invalid value 'vcan' for '--bus-kind <KIND>': \"vcan\" is not a kind of bus: use auto, socketcan or \
@@ -115,7 +117,8 @@ fn wrong_use_is_said_in_one_line() {
         ),
         (
             "up vcan0 --peer vcan1 --namespace nosuch",
-            "there is no network namespace nosuch in /run/netns: `sudo ip netns add nosuch` makes it, `ip netns` lists them; a process id or a path is accepted too",
+            "there is no network namespace nosuch in /run/netns: `ip netns` lists namespaces, `sudo ip netns \
+             add nosuch` creates it; a process id or a path is accepted too",
         ),
     ] {
         let said = folder.run(arguments);
@@ -143,7 +146,7 @@ fn a_plan_is_said_in_words_and_as_commands_and_nothing_is_done() {
         "{said:?}"
     );
     let said = folder.run("down skin.toml");
-    assert_eq!((said.code, said.out.as_str()), (0, "nosuchcan1 is not there\n"), "so nothing was made");
+    assert_eq!((said.code, said.out.as_str()), (0, "nosuchcan1 does not exist\n"), "so nothing was made");
 }
 
 #[test]
@@ -269,7 +272,7 @@ fn the_doctor_rates_the_kernel_by_the_choice() {
     let said = folder.run("doctor nosuchcan1 --bus-kind socketcan");
     let expected = match has_socketcan() {
         true => "fault there is no interface nosuchcan1\n",
-        false => ") has no CAN, and --bus-kind socketcan needs it\n        ",
+        false => ") does not support CAN, which --bus-kind socketcan needs\n        ",
     };
     assert!(said.out.contains(expected) && said.out.contains("No bench would run"), "{said:?}");
     assert_eq!((said.code, said.err.as_str()), (1, ""));
@@ -301,7 +304,7 @@ fn the_doctor_hears_gateways_and_cells() {
     assert_eq!(findings(&said, "fault"), [other_gateway]);
     let cells = [heartbeat(3), heartbeat(12)];
     let said = doctor_hears(&folder, "", &cells);
-    assert_eq!(findings(&said, "fault"), ["cells are on the embedded bus nosuchcan1 already: 3, 12"]);
+    assert_eq!(findings(&said, "fault"), ["cells are already on the embedded bus nosuchcan1: 3, 12"]);
     let said = doctor_hears(&folder, "--no-spawn", &cells);
     assert_eq!(findings(&said, "fault"), Vec::<String>::new());
     assert!(findings(&said, "note")[0].starts_with(

@@ -196,7 +196,7 @@ fn filters_change_in_order_with_the_frames() {
     assert_eq!(read_all(&client), expected);
 
     let error = client.set_filters(&vec![Filter::ALL; 513]).unwrap_err().to_string();
-    assert_eq!(error, "513 filters are too many for one socket on vcan0: at most 512");
+    assert_eq!(error, "513 filters are too many for one socket on vcan0: use at most 512");
     client.set_filters(&vec![exact(END_MARKER_ID); 512]).unwrap();
     wait_until_routed(&bench);
     other.send(&[frame(1, 5), frame(END_MARKER_ID, 0)]).unwrap();
@@ -413,8 +413,8 @@ fn a_client_that_alone_is_hung_up_on_is_not_told_that_the_server_ended() {
     rustix::net::shutdown(&bus, rustix::net::Shutdown::Write).unwrap();
     assert!(bus.wait(Some(FAILURE_TIMEOUT)).unwrap());
     let error = bus.receive(&mut Inbox::new()).unwrap_err();
-    let said = "the embedded bus vcan0 was closed: its server disconnected only this program and still serves others; attach \
-                again";
+    let said = "the embedded bus vcan0 was closed: its server disconnected this program, but still serves others; \
+                connect again";
     assert_eq!((error.to_string().as_str(), error.is_closed(), error.may_open_later()), (said, true, true));
     let sender = bench.open(&[]);
     sender.send(&[frame(1, 1)]).unwrap();

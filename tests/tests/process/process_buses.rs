@@ -81,7 +81,7 @@ fn ended_well(place: &TestDir, bench: Running, server: Option<Running>, times: u
         assert_eq!((silent.len(), summary.number(&format!("/buses/{index}/uplink/restarts"))), (0, 0));
         assert_eq!(summary.0["buses"][index]["name"], *bus);
     }
-    assert!(ended.stdout.contains("ticks without it"), "{}", ended.stdout);
+    assert!(ended.stdout.contains("ticks without the bus"), "{}", ended.stdout);
 }
 
 #[test]
@@ -166,7 +166,7 @@ fn while_a_bus_is_away_the_others_go_on_and_changes_are_sent_to_it_afterwards() 
     let [_, vcan1, _] = test_clients(&place);
     vcan1.waits_for_halted_cells(1..=4);
     place.start("skinbus", "frame resume --bus vcan2 --bus-kind embedded").end().succeeded();
-    bench.wait_for_stderr("the robot goes on");
+    bench.wait_for_stderr("the robot continues");
     test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     assert_eq!(bench.cells(), cells, "no cell was restarted");
     ended_well(&place, bench, Some(second), 1);
@@ -197,7 +197,7 @@ fn cells_that_were_away_receive_a_missed_resume_and_a_missed_touch() {
     first.end();
     bench.wait_for_stderr(LOST);
     place.start("skinbus", "frame resume --bus vcan0 --bus-kind embedded").end().succeeded();
-    bench.wait_for_stderr("the robot goes on");
+    bench.wait_for_stderr("the robot continues");
     // More than the two seconds after which the absent cells are touched.
     TestClient::on(&place, "vcan2", Format::Fd).waits_for_joints(150);
     let second = serve(&place, "vcan1");
@@ -218,7 +218,10 @@ fn a_bus_that_is_lost_at_the_end_makes_the_run_fail_with_its_figures() {
     bench.signal(Signal::TERM);
     let ended = bench.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
-    assert!(ended.stderr.ends_with("skinbus: lost at the end of the run: vcan1\n"), "{ended:#?}");
+    assert!(
+        ended.stderr.ends_with("skinbus: these buses were lost at the end of the run: vcan1\n"),
+        "{ended:#?}"
+    );
     let summary = place.summary();
     summary.adds_up();
     assert_eq!(summary.0["buses"][1]["outages"]["at_end"], true, "{:#}", summary.0);
@@ -241,7 +244,7 @@ fn a_robot_that_must_not_go_on_without_a_bus_is_halted_until_it_is_back() {
     let second = serve(&place, "vcan1");
     bench.wait_for_stderr("vcan1 works again");
     place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().succeeded();
-    bench.wait_for_stderr("the robot goes on");
+    bench.wait_for_stderr("the robot continues");
     test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     ended_well(&place, bench, Some(second), 1);
     assert!(place.summary().count("/loop/bad_cycles", "the torque is not valid") >= 25);

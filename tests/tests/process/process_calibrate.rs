@@ -33,17 +33,16 @@ fn a_calibration_finds_cells_and_its_recording_finds_the_same() {
     place.write("skin.toml", &skin.replace("serial = 100001", "serial = 7"));
     let (refused, nothing, why) = calibrate(&place, "--recording run.mcap -o other.toml");
     assert_eq!((refused, nothing), (Some(2), None), "{why}");
-    assert!(
-        why.contains("was recorded with another skin: serial numbers 100002, but 100001 in the recording"),
-        "{why}"
-    );
+    let other = "was recorded with a different skin: serial numbers: 100002 in the given skin, but 100001 in the \
+                 recording";
+    assert!(why.contains(other), "{why}");
     assert!(!exists("other.toml"));
     place.write("skin.toml", &skin);
     let Some(found) = found else {
         // A machine that is late too often: the refusal names the gaps, and no file is written.
         assert_eq!(code, Some(1));
         assert!(
-            said.contains("in the broadcasts") && repeated.contains("in the broadcasts"),
+            said.contains("joint broadcasts have") && repeated.contains("joint broadcasts have"),
             "{said}{repeated}"
         );
         assert!(!exists("found.toml") && !exists("again.toml") && !exists("found.html"));
@@ -75,16 +74,16 @@ fn what_cannot_be_calibrated_is_refused_in_one_line() {
     };
     assert_eq!(
         refused("--start 0.5 --dry-run"),
-        "skinbus: the pose has 1 positions; the robot has 6 joints: give one for each\n"
+        "skinbus: the pose has 1 positions, but the robot has 6 joints: give one position for each joint\n"
     );
     assert_eq!(
         refused("--duration 5s --dry-run"),
-        "skinbus: a motion of 5 s is too short or too long: choose 20 to 3600 s\n"
+        "skinbus: the motion cannot last 5 s: choose 20 to 3600 s\n"
     );
     place.write("sheet.toml", "noise_g = 3.0\n");
     assert_eq!(
         refused("--data-sheet sheet.toml --dry-run"),
-        "skinbus: sheet.toml:1:11: noise_g = 3: 0 to 1 are possible\n"
+        "skinbus: sheet.toml:1:11: noise_g = 3: must be 0 to 1\n"
     );
     place.write("empty.log", "(1.000000) vcan0 080##1\n");
     let said = refused("--recording empty.log");

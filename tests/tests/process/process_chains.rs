@@ -173,7 +173,8 @@ fn a_joint_that_slides_has_its_own_units() {
     // The skin of another robot is reported, and not used.
     fs::copy(example("panda.urdf"), place.path("panda.urdf")).unwrap();
     run(&place, "skin import panda.urdf --tip hand -o other.toml");
-    let another = "vcan0 carries 8 joints, but the skin's chain on it has 7: this skin is for another robot";
+    let another = "joints messages on vcan0 have 8 positions, but the skin's chain on this bus has 7 joints: name \
+                   the skin of this robot";
     let ended = run(&place, "dump run.log --skin other.toml --json --kind torque --from 1");
     assert!(ended.stderr.contains(another) && ended.stderr.lines().count() == 1, "{}", ended.stderr);
     let raw: Value = serde_json::from_str(ended.stdout.lines().last().unwrap()).unwrap();
@@ -195,21 +196,23 @@ fn a_report_names_the_torque_format_that_would_have_fitted() {
         place.read("run.html").split_whitespace().collect::<Vec<_>>().join(" ")
     };
     let page = report();
-    assert!(!page.contains("would have fitted") && page.contains("vcan0 Q3.12, used"), "it fits");
+    assert!(!page.contains("would have been better") && page.contains("vcan0 Q3.12, used"), "it fits");
     place.scenario(&place.read("scenario.toml").replace("force_n = 2.0", "force_n = 60.0"));
     let page = report();
-    let (_, advice) = page.split_once("vcan0: Q5.10 would have fitted better: ").expect("advice");
+    let advice = "vcan0: the torque format Q5.10 would have been better: ";
+    let (_, advice) = page.split_once(advice).expect("advice");
     let advice = advice.split_once("</p>").expect("a sentence").0.replace('\u{a0}', " ");
-    let (torques, rounds) =
-        advice.split_once(" torques are beyond 8 Nm, the range of Q3.12. It rounds by ").unwrap();
+    let between = " torques are beyond 8 Nm, the range of Q3.12. Its mean rounding error is ";
+    let (torques, rounds) = advice.split_once(between).unwrap();
     assert!(torques.parse::<u32>().unwrap() > 0, "{advice}");
     let (better, worse) = rounds.split_once(" µNm instead of ").unwrap();
-    let worse = worse.split_once(" µNm on average").unwrap().0;
+    let worse = worse.split_once(" µNm.").unwrap().0;
     let [better, worse] = [better, worse].map(|text| text.parse::<f64>().unwrap());
     assert!(worse > 10.0 && better > worse && better < 1_000.0, "a coarser step: {advice}");
     let skin =
         place.read("skin.toml").replace("name = \"vcan0\"\n", "name = \"vcan0\"\ntorque_format = \"Q7.8\"\n");
     place.write("skin.toml", &skin);
     let page = report();
-    assert!(page.contains("vcan0: Q5.10 would have fitted better: it holds every torque too"), "a finer one");
+    let advice = "vcan0: the torque format Q5.10 would have been better: it also covers every torque";
+    assert!(page.contains(advice), "a finer one");
 }

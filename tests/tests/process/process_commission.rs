@@ -337,7 +337,8 @@ fn unknown_nodes_are_named_and_left_alone_and_missing_cells_are_named() {
     workshop.place.write("skin.toml", &without);
     let ended = workshop.commission("").end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
-    let unknown_node = "cells on vcan0 that are not in skin.toml, left alone: 4 (serial number 100004)";
+    let unknown_node =
+        "cells on vcan0 that are not in skin.toml were left unchanged: 4 (serial number 100004)";
     assert!(ended.stderr.contains(unknown_node), "{ended:#?}");
     assert!(ended.stdout.contains("is not on the bus: switch it on"), "{ended:#?}");
     let listed = workshop.list("--skin skin.toml").unwrap();
@@ -382,7 +383,7 @@ fn an_interrupted_commissioning_says_how_far_it_came() {
     running.signal(Signal::INT);
     let ended = running.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
-    assert!(ended.stderr.ends_with("skinbus: interrupted; nothing was written yet\n"), "{ended:#?}");
+    assert!(ended.stderr.ends_with("skinbus: interrupted before anything was written\n"), "{ended:#?}");
     workshop.none_is_mixed();
 }
 

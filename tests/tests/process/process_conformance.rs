@@ -132,7 +132,8 @@ fn passes(format: Format) {
     assert_eq!(cell.has(), before, "it is left as it was");
     assert!(!cell.place.path("conformance-vcan0-5.json").exists());
     let junit = cell.place.read("cell.xml");
-    assert!(junit.contains("<testcase classname=\"cell.md\" name=\"CONF-7 commit\"/>"), "{junit}");
+    let case = "<testcase classname=\"cell.md\" name=\"CONF-7 commit of a configuration\"/>";
+    assert!(junit.contains(case), "{junit}");
     assert_eq!(junit.matches("<testcase").count(), requirements.len());
 }
 
@@ -175,7 +176,7 @@ fn after_a_kill_the_file_puts_the_cell_back() {
     let refused = cell.conformance("").end();
     assert_eq!(
         refused.refusal(2),
-        "skinbus: conformance-vcan0-5.json was left by an earlier test that did not restore the cell: restore it with \
+        "skinbus: an earlier test left conformance-vcan0-5.json and did not restore the cell: restore the cell with \
          --restore conformance-vcan0-5.json, or delete the file"
     );
     cell.conformance("--restore conformance-vcan0-5.json").end().succeeded();
@@ -193,7 +194,7 @@ fn a_cell_that_dies_is_said_and_its_file_is_kept() {
     process::signal(pid, Signal::KILL);
     let ended = test.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
-    assert!(ended.stderr.contains("the cell was not restored: the cell fell silent"), "{ended:#?}");
+    assert!(ended.stderr.contains("the cell was not restored: the cell stopped sending"), "{ended:#?}");
     assert!(ended.stderr.lines().count() == 1, "{ended:#?}");
     cell.restart();
     cell.conformance("--restore conformance-vcan0-5.json").end().succeeded();
@@ -207,7 +208,7 @@ fn what_cannot_be_tested_is_refused_in_a_line() {
         (
             "--requirement CONFI",
             2,
-            "--requirement CONFI: no requirement has this id; CONF-7 and CONF are examples",
+            "--requirement CONFI: no requirement has this id; give an id such as CONF-7, or a group such as CONF",
         ),
         ("--format classic", 1, "cell 5 sends fd frames on vcan0, not classic: use --format fd"),
         ("--restart false --requirement CLAIM", 1, "the command of --restart failed: exit status: 1"),
@@ -223,7 +224,8 @@ fn what_cannot_be_tested_is_refused_in_a_line() {
     };
     assert_eq!(
         of(6).refusal(1),
-        "skinbus: cell 6 sends nothing on vcan0, unlike 5: switch it on, or give its actual node id"
+        "skinbus: cell 6 sends nothing on vcan0, but these cells do: 5; switch the cell on, or give its actual \
+         node id"
     );
     let words = "--bus vcan0 --bus-kind embedded --node 3 --skin skin.toml";
     let other = cell.place.start("cell-node", words);
@@ -234,8 +236,8 @@ fn what_cannot_be_tested_is_refused_in_a_line() {
     });
     assert_eq!(
         of(5).refusal(1),
-        "skinbus: other cells are on vcan0: 3; joints and halts of the test reach them too: remove them, or use \
-         --others-will-stop"
+        "skinbus: other cells are on vcan0: 3; the test would send joints and halts to them too: disconnect them, or \
+         use --others-will-stop"
     );
     // A busy machine may keep the cell waiting for longer than its time to answer.
     until("a test beside a cell that is tolerated", || {
@@ -274,7 +276,8 @@ fn a_second_cell_with_its_node_id_and_a_second_gateway_are_named() {
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     assert_eq!(
         ended.stderr,
-        "skinbus: 003##500000000000000000000000000004782 was sent by another program: stop the gateway on this bus\n"
+        "skinbus: another program sent frame 003##500000000000000000000000000004782 to the cells: stop the gateway on \
+         this bus\n"
     );
     assert_eq!(cell.has(), before);
     let test = cell.conformance("--requirement CMD");
@@ -283,7 +286,7 @@ fn a_second_cell_with_its_node_id_and_a_second_gateway_are_named() {
         (!test.stderr().is_empty()).then_some(())
     });
     let said = test.end();
-    assert!(said.refusal(1).starts_with("skinbus: a gateway is on vcan0 (003##5"), "{said:#?}");
+    assert!(said.refusal(1).starts_with("skinbus: a gateway sends on vcan0 (frame 003##5"), "{said:#?}");
 }
 
 #[test]

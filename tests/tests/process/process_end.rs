@@ -89,9 +89,9 @@ fn a_signal_while_starting_is_a_failed_run_with_a_summary_and_a_log() {
     let bench = place.bench(600.0, "--quiet --record run.mcap");
     until("the first cells", || (!bench.cells().is_empty()).then_some(()));
     bench.signal(Signal::INT);
-    assert_eq!(bench.end().refusal(1), "skinbus: interrupted while starting");
+    assert_eq!(bench.end().refusal(1), "skinbus: the run was interrupted while it was starting");
     place.is_left_clean();
-    assert_eq!(place.summary().0["failure"], "interrupted while starting");
+    assert_eq!(place.summary().0["failure"], "the run was interrupted while it was starting");
     // Frames received before are in the log, if there were any.
     let files: Vec<_> = place.files().into_iter().filter(|name| name != "run.log").collect();
     assert_eq!(files, ["run.json", "scenario.toml", "skin.toml"]);

@@ -79,9 +79,9 @@ fn a_controller_that_is_killed_halts_the_robot_and_another_one_takes_over_after_
     // A hello does not resume the robot; a person has to do that.
     let second = python(&place);
     second.wait_for_stdout("HALTED");
-    assert!(!bench.stderr().contains("goes on"), "{}", bench.stderr());
+    assert!(!bench.stderr().contains("the robot continues"), "{}", bench.stderr());
     place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().succeeded();
-    bench.wait_for_stderr("the robot goes on");
+    bench.wait_for_stderr("the robot continues");
     place.test_client().waits_for_motion();
     bench.signal(Signal::TERM);
     bench.end().succeeded();

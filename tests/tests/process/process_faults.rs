@@ -250,8 +250,8 @@ fn cells_on_the_bus_are_not_started_twice() {
         "cell 3",
         |message| matches!(message, Message::Network { from: Node::Cell(cell), .. } if cell.get() == 3),
     );
-    let said = "skinbus: cells are on the bus already: 2, 3 on vcan0; use them with --no-spawn, stop them, or set \
-                SKINBUS_DIR to another directory for this run";
+    let said = "skinbus: these cells are already on the bus: 2, 3 on vcan0; use them with --no-spawn, stop them, or \
+                set SKINBUS_DIR to another directory for this run";
     assert_eq!(place.bench(1.0, "--quiet").end().refusal(1), said);
     drop((cells, server));
 }
@@ -377,7 +377,7 @@ fn a_halt_from_a_shell_halts_the_robot_and_ack_resumes_it() {
         "the robot is halted: a halt frame was received; `skinbus frame resume --bus vcan0 --bus-kind embedded` resumes it",
     );
     place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().succeeded();
-    bench.wait_for_stderr("the robot goes on");
+    bench.wait_for_stderr("the robot continues");
     let test_client = place.test_client();
     test_client.waits_for("a torque", torque_of(1));
     test_client.waits_for_motion();

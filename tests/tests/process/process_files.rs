@@ -348,7 +348,7 @@ fn any_number_of_demonstrations_go_on_side_by_side() {
         demo.wait_for_loop();
         let said = demo.stderr();
         // The printed command shows its frames.
-        let line = said.lines().find_map(|line| line.strip_prefix("to see its frames decoded: ")).unwrap();
+        let line = said.lines().find_map(|line| line.strip_prefix("to see the decoded frames: ")).unwrap();
         let (directory, dump) = line.strip_prefix("SKINBUS_DIR=").unwrap().split_once(" skinbus ").unwrap();
         let mut dump = place.command("skinbus", &format!("{dump} --kind torque -n 3"));
         dump.env("SKINBUS_DIR", directory);

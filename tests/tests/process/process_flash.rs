@@ -60,16 +60,16 @@ fn a_damaged_file_is_not_used_and_the_gateway_names_the_cell() {
     let mut said: Vec<_> = ended.stderr.lines().collect();
     said.sort_unstable();
     let expected = [
-        "cell-node: flash of cell 3 (flash/vcan0-3.flash) is not used: the CRC of the image is wrong; write it again or \
-         delete the file"
+        "cell-node: flash of cell 3 (flash/vcan0-3.flash) is not used: the CRC of the flash image is wrong; \
+         commission the cell again, or delete the file"
             .to_owned(),
         format!(
-            "cell-node: flash of cell 5 (flash/vcan0-5.flash) is not used: the image has 40 bytes, not {} to 445; write it again or \
-             delete the file",
+            "cell-node: flash of cell 5 (flash/vcan0-5.flash) is not used: the flash image has 40 bytes, not \
+             {} to 445; commission the cell again, or delete the file",
             image.len()
         ),
-        "skinbus: cells without parameters: 3, 5 on vcan0; write them with `skinbus commission`, or delete \
-         their flash files if these are damaged"
+        "skinbus: these cells have no parameters: 3, 5 on vcan0; write the parameters with `skinbus commission`, or \
+         delete the cells' flash files if these are damaged"
             .to_owned(),
     ];
     assert_eq!(said, expected);
@@ -91,7 +91,7 @@ fn what_is_no_regular_file_is_no_flash_and_delays_nothing() {
     let (kind, mode) = (rustix::fs::FileType::Fifo, rustix::fs::Mode::from_raw_mode(0o600));
     rustix::fs::mknodat(rustix::fs::CWD, &path, kind, mode, 0).unwrap();
     let ended = place.bench(1.0, "--flash flash --quiet").end();
-    let why = "flash of cell 3 (flash/vcan0-3.flash): it is a named pipe, a file is needed";
+    let why = "flash of cell 3 (flash/vcan0-3.flash): it is a named pipe, but a file is needed";
     assert!(ended.code() == Some(1) && ended.stderr.contains(why), "{ended:#?}");
 }
 
@@ -103,7 +103,9 @@ fn a_cell_without_parameters_reports_it_and_sends_no_torque() {
     server.wait_for_stdout("serving vcan0 at ");
     let cells = place
         .start("cell-node", "--bus vcan0 --bus-kind embedded --nodes 1-8 --skin skin.toml --flash flash");
-    cells.wait_for_stderr("flash of cell 3 (flash/vcan0-3.flash) is not used: the CRC of the image is wrong");
+    cells.wait_for_stderr(
+        "flash of cell 3 (flash/vcan0-3.flash) is not used: the CRC of the flash image is wrong",
+    );
     place.test_client().waits_for("a heartbeat of cell 3 without parameters", |message| {
         matches!(message, Message::Network { from: Node::Cell(cell), page: NetworkPage::Heartbeat(heartbeat), .. }
             if cell.get() == 3
@@ -112,7 +114,7 @@ fn a_cell_without_parameters_reports_it_and_sends_no_torque() {
                 && heartbeat.configuration == 0)
     });
     let bench = place.running_bench(600.0, "--no-spawn");
-    bench.wait_for_stderr("cells that have no parameters; the run goes on without them: 3 on vcan0");
+    bench.wait_for_stderr("these cells have no parameters, so the run continues without them: 3 on vcan0");
     place.test_client().waits_for_epoch(20);
     bench.signal(Signal::TERM);
     bench.end().succeeded();
@@ -131,7 +133,7 @@ fn cells_that_are_configured_for_another_skin_are_refused_by_name() {
     let text = place.read("skin.toml");
     let other = text.replace("alpha_c = 1.0", "alpha_c = 1.5");
     place.write("skin.toml", &other);
-    let said = "skinbus: cells that are not configured for skin.toml: 1, 2, 3, 4, 5, 6, 7, 8 on \
+    let said = "skinbus: these cells are not configured for skin.toml: 1, 2, 3, 4, 5, 6, 7, 8 on \
                 vcan0; configure them with `skinbus commission`, or delete their flash files";
     assert_eq!(place.bench(1.0, "--flash flash --quiet").end().refusal(1), said);
     place.is_left_clean();
@@ -141,10 +143,10 @@ fn cells_that_are_configured_for_another_skin_are_refused_by_name() {
     let ended = place.bench(1.0, "--flash flash --quiet").end();
     assert_eq!(ended.code(), Some(1));
     assert!(
-        ended.stderr.contains("is not used: the image belongs to cell 6 with serial number 100006"),
+        ended.stderr.contains("is not used: the flash image belongs to cell 6 with serial number 100006"),
         "{ended:#?}"
     );
-    assert!(ended.stderr.contains("skinbus: cells without parameters: 6 on vcan0"), "{ended:#?}");
+    assert!(ended.stderr.contains("skinbus: these cells have no parameters: 6 on vcan0"), "{ended:#?}");
     place.is_left_clean();
     assert_eq!(images(&place), before);
 }
@@ -153,11 +155,11 @@ fn cells_that_are_configured_for_another_skin_are_refused_by_name() {
 fn a_directory_that_is_not_there_is_named() {
     let place = TestDir::new();
     place.pressed();
-    let said = "skinbus: --flash flash: there is no such directory; make it first";
+    let said = "skinbus: --flash flash: this directory does not exist; create it first";
     assert_eq!(place.bench(1.0, "--flash flash").end().refusal(2), said);
     let cell =
         place.start("cell-node", "--bus vcan0 --bus-kind embedded --node 1 --skin skin.toml --flash flash");
-    let said = "cell-node: --flash flash: there is no such directory; make it first";
+    let said = "cell-node: --flash flash: this directory does not exist; create it first";
     assert_eq!(cell.end().refusal(2), said);
     assert_eq!(place.files(), ["scenario.toml", "skin.toml"]);
     place.is_left_clean();

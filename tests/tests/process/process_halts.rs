@@ -15,7 +15,7 @@ use serde_json::Value;
 const MISSING: &str = "the external controller's answer is missing";
 const NOBODY: &str = "no external controller is connected";
 /// The end of the last line of a run that was halted.
-const HISTORY: &str = "; --summary FILE keeps the ticks before it";
+const HISTORY: &str = "; --summary FILE saves the ticks before the halt";
 
 /// Answers a number of ticks, then only listens until the robot is halted.
 fn control(place: &TestDir, bench: &Running, answers: u32) {
@@ -136,7 +136,10 @@ fn a_lost_bus_that_halts_is_named_and_the_exit_code_is_that_of_the_halt() {
     place.is_left_clean();
     let summary = place.summary();
     let halted = ended_halted(&ended, &summary, "too many bad cycles in a row: the torque is not valid");
-    assert!(ended.stderr.contains("\nskinbus: lost at the end of the run: vcan1\n"), "{ended:#?}");
+    assert!(
+        ended.stderr.contains("\nskinbus: these buses were lost at the end of the run: vcan1\n"),
+        "{ended:#?}"
+    );
     let before = before(&summary, &halted);
     let last = before.last().unwrap();
     assert_eq!((&last["valid"], &last["lost_buses"]), (&false.into(), &serde_json::json!(["vcan1"])));
@@ -154,7 +157,7 @@ fn a_resumed_halt_is_reported_and_the_run_succeeds() {
     place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().succeeded();
     bench.wait_for_stderr("the robot is halted: a halt frame was received");
     place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().succeeded();
-    bench.wait_for_stderr("the robot goes on");
+    bench.wait_for_stderr("the robot continues");
     bench.signal(Signal::TERM);
     let ended = bench.end().succeeded();
     place.is_left_clean();
@@ -178,7 +181,7 @@ fn an_incomplete_recording_takes_precedence_over_a_halt() {
     let said: Vec<_> = ended.stderr.lines().collect();
     let halted = format!(" and not resumed: too many bad cycles in a row: {NOBODY}{HISTORY}");
     assert!(said.iter().any(|line| line.ends_with(&halted)), "{ended:#?}");
-    assert!(said.last().unwrap().starts_with("skinbus: the recording is incomplete, "), "{ended:#?}");
+    assert!(said.last().unwrap().starts_with("skinbus: the recording is incomplete: "), "{ended:#?}");
     let summary = place.summary();
     assert_eq!(summary.0["outcome"], "failed");
     assert!(summary.0["halted"].is_string() && !before(&summary, &summary.0["halts"][0]).is_empty());

@@ -146,7 +146,8 @@ fn links_are_covered_and_the_skin_runs() {
     refused(
         &place,
         "run skin.toml --bus-kind embedded --record no.mcap",
-        "robot.urdf: arm.urdf:1: not XML: a URDF begins with <?xml or <robot; name the robot's URDF; correct the skin's path, or take the key out",
+        "robot.urdf: arm.urdf:1: not XML: a URDF begins with <?xml or <robot; name the robot's URDF; correct the \
+         path in the skin, or remove the key",
     );
     fs::remove_file(place.path("arm.urdf")).unwrap();
     refused(
@@ -191,10 +192,10 @@ fn what_cannot_be_covered_is_said_in_a_line() {
         (cover("fore", "--leave-out fore"), "--leave-out fore: --cover names this link"),
         (
             cover("fore", "--leave-out plat"),
-            "--leave-out plat: arm.urdf: there is no link \"plat\"; the nearest are",
+            "--leave-out plat: arm.urdf: there is no link \"plat\"; similar names:",
         ),
         (cover("bare", with), "--cover bare: arm.urdf has no visual for this link"),
-        (cover("forearm", with), "--cover forearm: arm.urdf: there is no link \"forearm\"; the nearest are"),
+        (cover("forearm", with), "--cover forearm: arm.urdf: there is no link \"forearm\"; similar names:"),
         (cover("base", with), "--cover base: no chain moves this link: use one of upper, fore"),
         (cover("fore,fore", with), "--cover fore: this link is named twice"),
         (cover("fore", "--pitch 2"), "a length from 0.001 to 1 m"),
@@ -218,14 +219,14 @@ fn what_is_no_chain_of_joints_is_said_in_a_line() {
     for (text, words, expected) in [
         (floating.as_str(), "--tip bare", "joint \"shoulder\" is floating"),
         (&mimic, "--tip bare", "joint \"shoulder\" mimics \"elbow\""),
-        (&far, "--tip bare", " m is possible"),
+        (&far, "--tip bare", "; it must be "),
         ("", "--tip bare", "the file is empty"),
         (
             "<robot xmlns:xacro=\"x\"><xacro:a/></robot>",
             "--tip bare",
             "`xacrodoc arm.urdf -o NEW.urdf` (pip install xacrodoc)",
         ),
-        (ARM, "--tip hand", "there is no link \"hand\"; the nearest are"),
+        (ARM, "--tip hand", "there is no link \"hand\"; similar names:"),
         (ARM, "--tip bare --tip bare", "--tip bare: this tip is named twice"),
         (ARM, "--tip base", "no joint moves between"),
     ] {
@@ -243,7 +244,7 @@ fn what_is_no_chain_of_joints_is_said_in_a_line() {
              not \"link,px,py,pz,nx,ny,up\": correct it",
         ),
         ("fore,0,0,0,0,0,1\n".to_owned(), "not \"fore,0,0,0,0,0,1\": write the header above it"),
-        (format!("{head}\nfore,0,0,x,0,0,1\n"), "cells.csv: line 2: pz = \"x\": a finite number is needed"),
+        (format!("{head}\nfore,0,0,x,0,0,1\n"), "cells.csv: line 2: pz = \"x\": use a finite number"),
         (format!("{head}\nfore,0,0,0,0,0,1\nfourth,0,0,0,0,0,1\n"), "cells.csv: line 3: "),
         (format!("{head}\nfore,0,0,0,0,0,0\n"), "line 2: the normal"),
         (
@@ -258,7 +259,7 @@ fn what_is_no_chain_of_joints_is_said_in_a_line() {
         ),
         (
             format!("{head},bus,node\nfore,0,0,0,0,0,1,,300\n"),
-            "skinbus: cells.csv: line 2: node = \"300\": 1 to 254 are possible",
+            "skinbus: cells.csv: line 2: node = \"300\": use 1 to 254",
         ),
         (
             format!("{head},bus,node\nfore,0,0,0,0,0,1,,\nupper,0,0,0,0,0,1,,1\n"),
@@ -295,7 +296,7 @@ fn a_robot_has_at_most_32_joints() {
         refused(
             &place,
             &format!("skin import arms.urdf --tip a12 --tip b12 --tip c12{cells}"),
-            "skinbus: arms.urdf: 36 joints move between the root and the tips; a robot has 1 to 32: give fewer --tip",
+            "skinbus: arms.urdf: 36 joints move between the root and the tips; a robot must have 1 to 32: use fewer --tip options",
         );
         run(&place, &format!("skin import arms.urdf --tip a12 --tip b12{cells}")).succeeded();
     }
@@ -373,7 +374,7 @@ fn torques_of_a_force_are_computed_in_both_ways() {
     for (words, expected) in [
         ("--cell 9 --force 1 --joints 0,0.5", "--cell 9: the skin has no such cell on vcan0"),
         ("--cell 1 --force 1 --joints 0", "one is needed for each of the chain's 2 joints: shoulder, elbow"),
-        ("--cell 1 --force 1 --joints 0,x", "position \"x\" of elbow: a number in rad is needed"),
+        ("--cell 1 --force 1 --joints 0,x", "position \"x\" of elbow: use a number in rad"),
         ("--cell 1 --force -1 --joints 0,0.5", "force -1 N: the force against the outward normal"),
         ("--cell 1 --force 95.998 --joints 0,0.5", "skinbus: --cell 1: force 95.998 N: "),
         (
@@ -401,14 +402,11 @@ fn torques_of_a_force_are_computed_in_both_ways() {
             "skinbus: rows.csv, row 2: cell vcan5:1: the skin has no such bus; it has vcan0",
         ),
         ("cell,force_n,q\n1,1,0\n", "skinbus: rows.csv, row 1: cell 1: 1 position given, but one is needed"),
-        (
-            "cell,force_n,q\n1,x,0 0.5\n",
-            "skinbus: rows.csv: line 2: force_n = \"x\": a finite number is needed",
-        ),
+        ("cell,force_n,q\n1,x,0 0.5\n", "skinbus: rows.csv: line 2: force_n = \"x\": use a finite number"),
         ("1,1,0 0.5\n2,1,0 0.5\n", ", not \"1,1,0 0.5\": write the header above it"),
         (
             "cell,force_n,q\n1,1,0 0.5\nvcan0:2,96,0 0.5\n",
-            "skinbus: rows.csv, row 2: cell vcan0:2: force 96 N: the force against the outward normal can be 0 to \
+            "skinbus: rows.csv, row 2: cell vcan0:2: force 96 N: the force against the outward normal must be 0 to \
              95.997 N, the range of three contact words",
         ),
         (

@@ -39,7 +39,8 @@ fn without_its_program_help_and_wrong_use_are_there_and_a_line_says_how_to_insta
     let wrong = run("link vcan0 --conect tcp/a:1");
     assert!(wrong.refusal(2).contains("a similar argument exists: '--connect'"), "{wrong:#?}");
     let absent = run("link vcan0 --listen tcp/127.0.0.1:0");
-    let says = "vcan-setup: vcan-link was found neither beside vcan-setup nor on PATH; to install it, in the project's folder: ";
+    let says = "vcan-setup: vcan-link was found neither beside vcan-setup nor on PATH; to install it, run in the \
+                project's folder: ";
     assert_eq!(absent.refusal(1), format!("{says}`{install}`"));
 }
 

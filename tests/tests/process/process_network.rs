@@ -330,7 +330,8 @@ fn flash_of_another_node_id_is_not_used() {
     fs::write(place.path("flash/vcan0-2.flash"), flash::encode(serial, &kept)).unwrap();
     let cell = cells(&place, "--node 2", "--flash flash");
     cell.wait_for_stderr(&format!(
-        "flash of cell 2 (flash/vcan0-2.flash) is not used: the image belongs to cell 7 with serial number {serial}"
+        "flash of cell 2 (flash/vcan0-2.flash) is not used: the flash image belongs to cell 7 with serial \
+         number {serial}"
     ));
     drop((cell, server));
 }

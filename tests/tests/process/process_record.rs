@@ -229,13 +229,16 @@ fn a_recording_that_exists_or_cannot_be_is_refused_before_anything_happens() {
         said,
         "skinbus: --candump old.log: it exists: name another file, or overwrite it with --overwrite"
     );
-    assert_eq!(refused("--record run.log"), "skinbus: --record run.log: a recording's name ends in .mcap");
+    assert_eq!(
+        refused("--record run.log"),
+        "skinbus: --record run.log: the name of a recording must end in .mcap"
+    );
     fs::create_dir(place.path("dir.mcap")).unwrap();
     assert!(refused("--record dir.mcap").contains("is a directory; name a file"));
     let gone = refused("--record gone/run.mcap");
     let why = "No such file or directory (os error 2); name a file in a folder that can be written";
     assert_eq!(gone, format!("skinbus: --record gone/run.mcap: {why}"));
-    assert!(refused("--record run.mcap --record-split 10").contains("a size from 1MB on"));
+    assert!(refused("--record run.mcap --record-split 10").contains("use a size of at least 1MB"));
     assert!(
         refused("--record same.mcap --summary same.mcap")
             .contains("--summary and --record name the same file")
@@ -281,7 +284,7 @@ fn in_shell(place: &TestDir, before: &str, run: &str, after: &str) -> process::E
 
 /// Ends a bench in a shell some broadcasts after its recording broke off.
 fn until_it_broke_off(place: &TestDir, shell: process::Running) -> process::Ended {
-    shell.wait_for_stderr("the run goes on without it");
+    shell.wait_for_stderr("the run continues without it");
     place.test_client().waits_for_joints(20);
     // The shell's own command line contains the name as well.
     let is_it = |line: &str| line.split(' ').next().is_some_and(|program| program.ends_with("/skinbus"));
@@ -296,11 +299,11 @@ fn broke_off(place: &TestDir, ended: &process::Ended, why: &str) {
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     assert!(ended.stdout.contains("8 cells"), "the table is complete: {ended:#?}");
     let said: Vec<_> =
-        ended.stderr.lines().filter(|line| line.contains("the run goes on without it")).collect();
+        ended.stderr.lines().filter(|line| line.contains("the run continues without it")).collect();
     assert!(said.iter().all(|line| line.contains(why)), "{ended:#?}");
     assert!(said.first().is_some_and(|line| line.starts_with("run.mcap: ")), "{ended:#?}");
     assert!(
-        ended.stderr.lines().last().unwrap().starts_with("skinbus: the recording is incomplete, "),
+        ended.stderr.lines().last().unwrap().starts_with("skinbus: the recording is incomplete: "),
         "{ended:#?}"
     );
     let summary = place.summary();

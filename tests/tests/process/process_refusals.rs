@@ -39,33 +39,33 @@ fn skin_refusal(old: &str, new: &str, expected: &str) {
 fn an_invalid_skin_is_refused_with_line_key_value_and_what_is_allowed() {
     for (old, new, expected) in [
         ("node = 2\n", "node = 1\n", "cell[1].node = 1: cell[0] already has this node id on \"vcan0\""),
-        ("node = 2\n", "node = 255\n", "cell[1].node = 255: a cell's node is 1 to 254"),
+        ("node = 2\n", "node = 255\n", "cell[1].node = 255: must be 1 to 254"),
         ("joint = 2\n", "joint = 7\n", "cell[0].joint = 7: the robot has joints 1 to 6"),
         ("joint = 2\n", "joint = 0\n", "cell[0].joint = 0: the robot has joints 1 to 6"),
         (
             "orientation = [0.0, 0.0, 0.0, 1.0]",
             "orientation = [0.0, 0.0, 0.0, 0.9]",
-            "cell[0].orientation = [0, 0, 0, 0.9]: this quaternion has length 0.900000; it must be 1 to within \
-             0.001",
+            "cell[0].orientation = [0, 0, 0, 0.9]: this quaternion has length 0.900000; it must be 1 to \
+             within 0.001",
         ),
         (
             "position = [",
             "position = [2.0, 0.0, 0.0]#[",
-            "cell[0].position = [2, 0, 0]: node 1 can be 2.000 m away from a frame of its rows, 0.001 m more than the \
-             1.999 m that Q1.14 can hold",
+            "cell[0].position = [2, 0, 0]: node 1 can be 2.000 m away from a frame of its rows, 0.001 m more \
+             than the 1.999 m that fit into Q1.14",
         ),
         (
             "[controller]",
             "[[bus]]\nname = \"vcan0\"\nreply = \"torque\"\nformat = \"fd\"\n\n[controller]",
-            "bus[1].name = \"vcan0\": this bus is named twice",
+            "bus[1].name = \"vcan0\": another bus already has this name",
         ),
         ("serial = 100001", "seriall = 100001", "unknown field `seriall`, expected one of"),
-        ("control_hz = 500.0", "control_hz = 0.0", "timing.control_hz = 0: 1 to 10000 Hz are possible"),
+        ("control_hz = 500.0", "control_hz = 0.0", "timing.control_hz = 0: must be 1 to 10000 Hz"),
         ("version = 1", "version = 2", "version = 2: this program reads version 1"),
         (
             "bus = \"vcan0\"\nnode = 1",
             "bus = \"vcan9\"\nnode = 1",
-            "cell[0].bus = \"vcan9\": no such bus; there is \"vcan0\"",
+            "cell[0].bus = \"vcan9\": the skin has no such bus; its buses are \"vcan0\"",
         ),
     ] {
         skin_refusal(old, new, expected);
@@ -81,7 +81,7 @@ fn a_fault_that_processes_cannot_make_is_refused() {
     ));
     let said = refusal(&place, "skinbus", "run skin.toml --scenario scenario.toml --bus-kind embedded", 2);
     assert!(
-        said.starts_with("skinbus: the fault \"drop\" of vcan0 at 1 s works only in virtual time"),
+        said.starts_with("skinbus: the scenario's fault \"drop\" of vcan0 at 1 s works only in virtual time"),
         "{said}"
     );
 }
@@ -101,7 +101,7 @@ fn a_scenario_that_does_not_fit_the_skin_is_refused() {
         ),
         (
             PRESSED.replace("\"step\"", "\"stepp\""),
-            "scenario.toml:17:11: touch[0].profile = \"stepp\": \"half-sine\", ",
+            "scenario.toml:17:11: touch[0].profile = \"stepp\": must be \"half-sine\", ",
         ),
         (
             PRESSED.replace("duration_s", "durations"),
@@ -122,16 +122,16 @@ fn files_that_are_not_there_are_named() {
     for (words, expected) in [
         ("run nowhere.toml", "nowhere.toml: No such file or directory (os error 2)"),
         ("run skin.toml --scenario nowhere.toml", "nowhere.toml: No such file or directory (os error 2)"),
-        ("run .", ".: it is a folder, a file is needed"),
+        ("run .", ".: it is a folder, but a file is needed"),
         (
             "run skin.toml SKINBUS_CELL_NODE=/nowhere",
-            "cell-node is not at /nowhere: build it with `cargo build --release`, or name its path in \
-             SKINBUS_CELL_NODE",
+            "the program cell-node is not at /nowhere: build it with `cargo build --release`, or set \
+             SKINBUS_CELL_NODE to its path",
         ),
         (
             "run skin.toml SKINBUS_VCAN_SETUP=/nowhere",
-            "vcan-setup is not at /nowhere: build it with `cargo build --release`, or name its path in \
-             SKINBUS_VCAN_SETUP",
+            "the program vcan-setup is not at /nowhere: build it with `cargo build --release`, or set \
+             SKINBUS_VCAN_SETUP to its path",
         ),
     ] {
         let said = refusal(&place, "skinbus", &format!("{words} --bus-kind embedded --candump run.log"), 2);
@@ -151,7 +151,7 @@ fn a_file_that_is_no_program_is_named() {
         "run skin.toml SKINBUS_CELL_NODE=skin.toml --bus-kind embedded --quiet",
         2,
     );
-    assert_eq!(said, "skinbus: ./skin.toml does not start: Permission denied (os error 13)");
+    assert_eq!(said, "skinbus: cannot start ./skin.toml: Permission denied (os error 13)");
     // A program that starts and is not a cell.
     let said = refusal(
         &place,
@@ -160,7 +160,7 @@ fn a_file_that_is_no_program_is_named() {
         1,
     );
     assert!(
-        said.ends_with(" on vcan0 ended while starting (exit status: 0); see the message above"),
+        said.ends_with(" on vcan0 ended while it was starting (exit status: 0); see the message above"),
         "{said}"
     );
 }
@@ -268,7 +268,7 @@ fn an_unusable_socket_of_an_external_controller_is_named_before_cells_are_starte
 fn wrong_options_are_one_line() {
     let place = TestDir::new();
     place.pressed();
-    let seconds = "a time above 0 s, up to 1e7 s (10, 500ms, 90s, 10min, 2h); try '--help'";
+    let seconds = "use a time above 0 s, up to 1e7 s, such as 10, 500ms, 90s, 10min or 2h; try '--help'";
     let needed = "the following required arguments were not provided";
     for (program, words, expected) in [
         ("skinbus", "run skin.toml --duration 0", format!("invalid value '0' for '--duration <TIME>': {seconds}")),
@@ -292,8 +292,8 @@ fn wrong_options_are_one_line() {
         (
             "cell-node",
             "--bus vcan0 --skin skin.toml --nodes 9-3",
-            "invalid value '9-3' for '--nodes <A-B>': two node ids of 1 to 254, the smaller one first, such as 1-64; \
-             try '--help'"
+            "invalid value '9-3' for '--nodes <A-B>': give two node ids from 1 to 254, the smaller one \
+             first, such as 1-64; try '--help'"
                 .to_owned(),
         ),
         (

@@ -189,7 +189,10 @@ fn cells_with_another_history_answer_as_they_did_then() {
     // Now cell 4 has another configuration than at the beginning.
     let ended = place.replay("run.log", "--expect --speed max --quiet").end();
     let line = ended.refusal(1);
-    assert!(line.contains("cells have another configuration than in the recording: 4 (recorded "), "{line}");
+    assert!(
+        line.contains("these cells have a different configuration in the recording: 4 (recorded "),
+        "{line}"
+    );
 }
 
 #[test]
@@ -204,7 +207,7 @@ fn cells_with_other_parameters_and_cells_that_are_not_there_are_named() {
     place.write("moved.toml", &moved);
     let ended = place.replay("run.log", "--expect --spawn --skin moved.toml --quiet").end();
     let line = ended.refusal(1);
-    let said = "skinbus: cells have another configuration than in the recording: 3 (recorded ";
+    let said = "skinbus: these cells have a different configuration in the recording: 3 (recorded ";
     assert!(
         line.starts_with(said) && line.ends_with("on vcan0; name the recording's skin with --skin"),
         "{line}"
@@ -215,7 +218,7 @@ fn cells_with_other_parameters_and_cells_that_are_not_there_are_named() {
     let line = ended.refusal(1);
     assert!(
         line.starts_with(
-            "skinbus: the recording is of another skin: the configurations of all 8 cells differ, "
+            "skinbus: the recording was made with another skin: the configurations of all 8 cells differ: "
         ),
         "{line}"
     );
@@ -223,12 +226,12 @@ fn cells_with_other_parameters_and_cells_that_are_not_there_are_named() {
 
     let bench = by_hand(&place, "1-6");
     let ended = place.replay("run.log", "--expect --quiet").end();
-    let said = "skinbus: cells of the recording are absent: 7, 8 on vcan0; start them with cell-node, or all with \
-                --spawn";
+    let said = "skinbus: these cells of the recording are not on the bus: 7, 8 on vcan0; start them with cell-node, \
+                or start all cells with --spawn";
     assert_eq!(ended.refusal(1), said);
     let ended = place.replay("run.log", &format!("{FRESH} --quiet")).end();
     let said =
-        "skinbus: cells are on vcan0 already: 1, 2, 3, 4, 5, 6; leave out --spawn to use them, or stop them";
+        "skinbus: these cells are already on vcan0: 1, 2, 3, 4, 5, 6; omit --spawn to use them, or stop them";
     assert_eq!(ended.refusal(1), said);
     drop(bench);
 }
@@ -252,7 +255,7 @@ fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
     let lines: Vec<_> = text.lines().map(str::trim).collect();
     assert!(lines[1].starts_with("recorded  torque 2 epoch ") && lines[1].ends_with(" Nm"), "{text}");
     assert!(lines[2].starts_with("now       torque 2 epoch "), "{text}");
-    assert_eq!(lines[3], "joint 2: 3 steps less (0.0007 Nm)", "{text}");
+    assert_eq!(lines[3], "joint 2: 3 steps lower (0.0007 Nm)", "{text}");
 
     // Within a tolerance a reply counts as equal.
     for (steps, code, replies) in [("2", 1, [1, 0]), ("3", 0, [0, 1])] {
@@ -264,8 +267,8 @@ fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
         assert_eq!([different, tolerated], replies, "{:#}", replayed.0);
         let words = &replayed.0["expect"]["torque_words"];
         assert_eq!((&words["by_steps"][3], &words["max"]), (&1.into(), &3.into()), "{:#}", replayed.0);
-        assert!(equal > 15 && ended.stdout.contains("torque words off by 3"), "{}", ended.stdout);
-        let said = "1 different, torque words by up to 3 steps (--tolerance 2)";
+        assert!(equal > 15 && ended.stdout.contains("torque words that differ by 3"), "{}", ended.stdout);
+        let said = "1 different, torque words differ by up to 3 steps (--tolerance 2)";
         assert_eq!(ended.stderr.contains(said), code == 1, "{ended:#?}");
     }
 
@@ -345,8 +348,8 @@ fn sums_without_their_children_come_back_in_any_tree() {
     assert!(text.starts_with(&format!("the first difference: cell {root} on vcan0, joints ")), "{text}");
     let lines: Vec<_> = text.lines().map(str::trim).collect();
     assert!(lines[1].starts_with(&format!("recorded  sum {root} epoch ")), "{text}");
-    assert!(lines[1].contains("; less its child"), "{text}");
-    assert_eq!(lines[3], "joint 2: 5 steps less (0.0195 Nm)", "{text}");
+    assert!(lines[1].contains("; minus its child"), "{text}");
+    assert_eq!(lines[3], "joint 2: 5 steps lower (0.0195 Nm)", "{text}");
     place.is_left_clean();
 }
 
@@ -377,7 +380,7 @@ fn a_foreign_capture_goes_to_another_bus_as_it_is() {
     let server = place.start("vcan-setup", "serve vcan0");
     server.wait_for_stdout("serving vcan0 at ");
     let dump = place.start("skinbus", "dump vcan0 --bus-kind embedded -n 4");
-    dump.wait_for_stderr("vcan0 is embedded");
+    dump.wait_for_stderr("vcan0: bus of kind embedded");
     let (ended, replayed) = place.replayed("foreign.log", "--map can7=vcan0 --map can8=vcan0");
     ended.succeeded();
     let ended = dump.end().succeeded();
@@ -410,8 +413,8 @@ fn a_cell_that_measures_obeys_for_the_replay_with_test_mode() {
     test_client.send(&mode(1, Request::Write { number, words: [0; WORDS] }));
     test_client.waits_for("a cell that measures", answers(1, 0));
     let ended = place.replay("run.log", &format!("--expect {to} --quiet")).end();
-    let said = "skinbus: cells use their own sensors and ignore stimuli, unlike in the recording: 3; --test-mode makes them \
-                obey during the replay";
+    let said = "skinbus: these cells use their own sensors and ignore stimuli, unlike in the recording: 3; use \
+                --test-mode, which puts them into test mode during the replay";
     assert_eq!(ended.refusal(1), said);
     let (ended, replayed) = place.replayed("run.log", &format!("--expect --speed max {to} --test-mode"));
     assert!(replayed.all_came_back(&ended) > 5, "{:#}", replayed.0);

@@ -104,35 +104,39 @@ fn invalid_input_is_refused_in_one_line() {
     let zip = place.path("some.zip");
     fs::write(&zip, b"PK\x03\x04..............").unwrap();
     for (words, code, said) in [
-        ("empty.log", 1, "skinbus: empty.log contains no frame"),
-        ("none.log", 1, "skinbus: none.log contains no frame"),
+        ("empty.log", 1, "skinbus: empty.log contains no frames"),
+        ("none.log", 1, "skinbus: none.log contains no frames"),
         ("nothing.log", 2, "skinbus: nothing.log: No such file"),
         ("some.zip", 2, "skinbus: some.zip is a zip"),
-        ("-", 2, "skinbus: a replay reads its capture twice, which standard input does not allow"),
-        ("some.log --from 5", 2, "skinbus: --from and --to leave nothing to send: some.log ends at 2.000 s"),
+        ("-", 2, "skinbus: a replay reads its capture twice, which is impossible with standard input"),
+        (
+            "some.log --from 5",
+            2,
+            "skinbus: --from and --to select no frames to send: some.log ends at 2.000 s",
+        ),
         ("some.log --map can0=can1", 2, "skinbus: --map can0=can1: some.log has no bus can0; it has vcan0"),
         ("some.log --bus can0", 2, "skinbus: --bus can0: some.log has no bus can0; it has vcan0"),
         (
             "some.log --map vcan0",
             2,
-            "skinbus: invalid value 'vcan0' for '--map <FROM=TO>': a bus of the capture and",
+            "skinbus: invalid value 'vcan0' for '--map <FROM=TO>': use a bus of the capture and",
         ),
         (
             "some.log --speed 101",
             2,
-            "skinbus: invalid value '101' for '--speed <X>': a number from 0.1 to 100",
+            "skinbus: invalid value '101' for '--speed <X>': use a number from 0.1 to 100",
         ),
         (
             "some.log --speed 0.01",
             2,
-            "skinbus: invalid value '0.01' for '--speed <X>': a number from 0.1 to 100",
+            "skinbus: invalid value '0.01' for '--speed <X>': use a number from 0.1 to 100",
         ),
         (
             "some.log --only replies --expect",
             2,
             "skinbus: --expect makes cells answer, but --only would send recorded",
         ),
-        ("some.log --expect --spawn", 2, "skinbus: --spawn: some.log has no skin attached"),
+        ("some.log --expect --spawn", 2, "skinbus: --spawn: some.log contains no skin"),
         (
             "some.log --map vcan0=can9 --spawn --skin skin.toml",
             2,
@@ -155,7 +159,7 @@ fn invalid_input_is_refused_in_one_line() {
     // A recording without heartbeats.
     let ended = place.replay("torques.log", "--expect --spawn --skin skin.toml --quiet").end();
     assert!(
-        ended.refusal(1).starts_with("skinbus: cells of the recording are absent: 12 on vcan0"),
+        ended.refusal(1).starts_with("skinbus: these cells of the recording are not on the bus: 12 on vcan0"),
         "{ended:#?}"
     );
 }
@@ -174,11 +178,11 @@ fn an_unreadable_line_is_named_and_omitted_and_times_that_run_backwards_are_repo
     assert_eq!(
         said[..4],
         [
-            "odd.log:2: column 4: digits of a second",
+            "odd.log:2: column 4: expected digits of a second",
             "odd.log: lines skipped because they could not be read: 1",
             "odd.log: 7 frames are missing: they were lost during recording",
-            "odd.log: times run backwards, first at frame 3 by 4.100 s: a frame older than one already sent is \
-             sent at once",
+            "odd.log: time stamps run backwards, first at frame 3 by 4.100 s: a frame that is older than one already \
+             sent is sent at once",
         ]
     );
     assert_eq!((replayed.number("/sent"), replayed.number("/sent_at_once")), (5, 2), "{:#}", replayed.0);

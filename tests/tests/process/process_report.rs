@@ -14,8 +14,7 @@ use process::{PRESSED, TestDir, names, skin};
 use recorded::Recorded;
 use serde_json::Value;
 
-const ERRORS: &str =
-    "Absolute errors, joint by joint: single cells where the joint carries them, and the whole skin's sum";
+const ERRORS: &str = "Absolute torque errors by joint: of single cells that load the joint, and of the sum over the whole skin";
 
 /// Runs a bench of eight cells that push the arm, compared all the time. Late cells halt it only after 20 s.
 fn recorded_bench(place: &TestDir, seconds: f64) -> Recorded {
@@ -174,9 +173,9 @@ fn figures_show_what_the_recording_holds_and_tables_what_the_gateway_counted() {
 
     let control = table(&page, "The control loop");
     for (name, key) in [
-        ("tick began late", "late_us"),
-        ("tick took", "took_us"),
-        ("central computation in it", "central_us"),
+        ("lateness of a tick", "late_us"),
+        ("duration of a tick", "took_us"),
+        ("central computation in a tick", "central_us"),
     ] {
         let quantile = |name: &str| format_quantity(summary.figure(&format!("/loop/{key}/{name}")), "µs");
         let expected = ["p50", "p90", "p99", "max"].map(quantile);
@@ -197,7 +196,7 @@ fn figures_show_what_the_recording_holds_and_tables_what_the_gateway_counted() {
         [counted("/buses/0/uplink/sent")]
     );
     let fact = |name: &str| &page.facts.iter().find(|(fact, _)| fact == name).unwrap().1;
-    assert!(fact("run's command").contains("--record run.mcap"));
+    assert!(fact("command of the run").contains("--record run.mcap"));
     assert!(fact("idle machine").contains("µs late (median)"));
 }
 
@@ -259,7 +258,7 @@ fn a_page_and_its_figures_are_complete_and_that_of_a_truncated_recording_names_w
     let ticks = recovered.on("/gateway/timing").count();
     let (link_down, missing) = page(&place, "cut.mcap");
     assert!(missing.is_some() && ticks > 0 && ticks < 1_000, "{ticks}");
-    assert_eq!(row(table(&link_down, "The control loop"), "tick took")[4], ticks.to_string());
+    assert_eq!(row(table(&link_down, "The control loop"), "duration of a tick")[4], ticks.to_string());
 }
 
 /// Returns the recorded forces on cells, with their times in ns since 1970.
@@ -340,7 +339,7 @@ fn touches_are_shown_when_and_where_the_recorder_saw_them_and_losses_where_cells
     }
     let moments = table(&page, "Moments of losses");
     assert!(moments.rows.iter().any(|row| row[1] == "vcan0: cell 3 is silent"), "{moments:?}");
-    let touches = table(&page, "Touches, cells of a link together");
+    let touches = table(&page, "Touches, grouped by link");
     assert!(touches.rows.iter().all(|row| row[2].contains("run.mcap --at ")), "{touches:?}");
     // The command counts from the first tick, like the column beside it.
     let first = forces.iter().filter(|(_, _, force)| *force > 0.0).map(|(nanos, ..)| *nanos).min().unwrap();

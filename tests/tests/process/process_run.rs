@@ -228,8 +228,8 @@ fn cells_that_measure_are_named_and_only_the_others_are_pressed() {
     test_client.waits_for("its answer", |message| matches!(message, Message::Configured { tag: 9, .. }));
 
     let ended = place.bench(1.5, "--no-spawn").end().succeeded();
-    let said = "cells that measure, so the scenario does not press them (`skinbus frame configure --cell N --write \
-                mode 1` puts one into test mode): 3 on vcan0\n";
+    let said = "these cells use their own sensors, so the scenario does not press them (`skinbus frame configure \
+                --cell N --write mode 1` puts one into test mode): 3 on vcan0\n";
     assert!(ended.stderr.contains(said), "{ended:#?}");
     assert!(ended.stdout.contains("cells that measure"), "{}", ended.stdout);
     let summary = place.summary();
@@ -252,15 +252,15 @@ fn a_gateway_without_cells_names_the_missing_ones() {
     let server = place.start("vcan-setup", "serve vcan0");
     server.wait_for_stdout("serving vcan0 at ");
     let ended = place.bench(1.0, "--no-spawn --quiet").end();
-    let said = "skinbus: cells that are not ready: 1, 2, 3, 4, 5, 6, 7, 8 on vcan0; start them with cell-node, \
-                or leave out --no-spawn";
+    let said = "skinbus: these cells are not ready: 1, 2, 3, 4, 5, 6, 7, 8 on vcan0; start them with cell-node, \
+                or omit --no-spawn";
     assert_eq!(ended.refusal(1), said);
     assert_eq!(place.files(), ["buses", "run.json", "scenario.toml", "skin.toml"]);
 
     // The running cells are enough.
     let cells = place.start("cell-node", "--bus vcan0 --bus-kind embedded --nodes 1-6 --skin skin.toml");
     let ended = place.bench(1.0, "--no-spawn").end().succeeded();
-    assert!(ended.stderr.contains("run goes on without them: 7, 8 on vcan0"), "{}", ended.stderr);
+    assert!(ended.stderr.contains("run continues without them: 7, 8 on vcan0"), "{}", ended.stderr);
     let summary = place.summary();
     assert_eq!(summary.adds_up().silent(), [7, 8]);
     summary.all_were_due(6, &ended.stderr);

@@ -92,8 +92,7 @@ fn a_running_bench_is_switched_from_a_shell_for_one_cell_and_for_all() {
     (1..=CELLS).for_each(tells);
     assert_eq!(switches(&place, "off"), "8 cells on vcan0 (embedded): off\n");
 
-    let why =
-        "skinbus: no cell 99 answers on vcan0: start it, or give the bus's format with --format classic";
+    let why = "skinbus: no answer from cell 99 on vcan0: start the cell, or give the bus's format with --format classic";
     assert_eq!(refusal(&place, "event --cell 99", 1), why);
     ends(bench);
     place.is_left_clean();
@@ -228,11 +227,13 @@ fn cells_that_were_pressed_before_are_compared_only_once_their_contact_is_known(
     // A run without touches leaves the cell as it is, and reports that its contact is unknown.
     place.scenario(head);
     let ended = place.bench(1.5, "--no-spawn").end().succeeded();
-    let said = "the contact of these cells is unknown, so their torques are not compared: 3 on vcan0;";
+    let said =
+        "it is unknown whether these cells are in contact, so their torques are not compared: 3 on vcan0;";
     assert!(ended.stderr.contains(said), "{}", ended.stderr);
     let summary = place.summary();
     let unknown = summary.of_bus("/replies/contact_unknown");
-    assert!(unknown > 0 && ended.stdout.contains(&format!("{unknown} not due: their contact is not known")));
+    let reason = format!("{unknown} not due: the contact of their cells is unknown");
+    assert!(unknown > 0 && ended.stdout.contains(&reason), "{}", ended.stdout);
     assert_eq!(summary.adds_up().of_bus("/replies/due"), 0, "{:#}", summary.0);
     assert_eq!(summary.number("/accuracy/single/count"), 0, "{:#}", summary.0);
 

@@ -185,8 +185,8 @@ fn an_adapter_that_was_deaf_when_it_was_opened_is_opened_again_at_its_first_refu
     pty.peer.wait_for_text("t0010\r");
     pty.peer.write_bytes(b"\x07");
     pty.peer.wait_for_text("\rC\rS6\rY0\rO\r");
-    bridge.wait_for_stderr("its adapter refuses frames (BEL)");
-    bridge.wait_for_stderr("1 more frames to the line lost, in total 1 dropped (1 refused by the adapter)");
+    bridge.wait_for_stderr("the adapter refuses frames (BEL)");
+    bridge.wait_for_stderr("1 more frames to the line lost; in total 1 dropped (refused by the adapter: 1)");
     // It is open now.
     pty.peer.write_bytes(b"\r\r\r");
     bench.client.send(&frames[1..]).unwrap();
@@ -209,7 +209,7 @@ fn a_bit_rate_that_an_adapter_does_not_have_is_reported() {
     pty.peer.write_bytes(b"\x07");
     pty.peer.wait_for_text("S6\r");
     pty.peer.write_bytes(b"\x07");
-    bridge.wait_for_stderr("its adapter refused a command of S6, Y2 (BEL)");
+    bridge.wait_for_stderr("the adapter refused a command of S6, Y2 (BEL)");
     pty.peer.wait_for_text("Y2\rO\r");
     let [line] = ended(bridge).try_into().unwrap();
     assert_eq!((&line["reopened"], &line["to_line"]["dropped"]["refused"]), (&0.into(), &0.into()), "{line}");
@@ -235,7 +235,7 @@ fn faults_of_an_adapter_are_reported_counted_and_error_frames_on_the_bus() {
     for fault in ["no ACK", "bus off", "bus error"] {
         until(fault, || bridge.stderr().contains(fault).then_some(()));
     }
-    assert!(bridge.stderr().contains(": its adapter reports "), "{}", bridge.stderr());
+    assert!(bridge.stderr().contains(": the adapter reports "), "{}", bridge.stderr());
     let [line] = ended(bridge).try_into().unwrap();
     assert_eq!(line["faults"], serde_json::json!({"no ACK": 1, "bus off": 1, "bus error": 1}));
     assert_eq!((&line["to_bus"]["sent"], &line["to_bus"]["other_lines"]), (&3.into(), &0.into()));
@@ -292,14 +292,14 @@ fn goes_and_returns(
         bench.client.send(&[frame]).unwrap();
         assert_eq!(peer.receives(1), [frame], "{address}");
         peer.write_bytes(b"t12");
-        let before = bridge.stderr().matches(": unavailable (").count();
+        let before = bridge.stderr().matches(": the line is unavailable (").count();
         gone(peer);
         until("the end to be noticed", || {
-            (bridge.stderr().matches(": unavailable (").count() > before).then_some(())
+            (bridge.stderr().matches(": the line is unavailable (").count() > before).then_some(())
         });
         bench.client.send(&[frame]).unwrap();
     }
-    until("all losses", || bridge.stderr().contains("3 dropped (3 line away)").then_some(()));
+    until("all losses", || bridge.stderr().contains("3 dropped (line unavailable: 3)").then_some(()));
     let [line] = ended(bridge).try_into().unwrap();
     assert_eq!((&line["opened"], &line["lost"]), (&3.into(), &3.into()), "{line}");
     assert_eq!(line["to_line"]["dropped"]["line_away"], 3, "{line}");
@@ -398,12 +398,12 @@ fn a_bus_goes_and_returns() {
     let mut pty = Pty::new();
     let bridge = bench.joined(&pty.path.display().to_string());
     bench.server.signal(Signal::TERM);
-    bridge.wait_for_stderr("its bus is unavailable (the embedded bus vcan0 was closed: its server ended)");
+    bridge.wait_for_stderr("the bus is unavailable (the embedded bus vcan0 was closed: its server ended)");
     let frame = Frame::classic(0x123, &[5]).unwrap();
     pty.peer.sends(&[frame]);
     let server = bench.place.start("vcan-setup", "serve vcan0");
     server.wait_for_stdout("serving");
-    bridge.wait_for_stderr("its bus is back");
+    bridge.wait_for_stderr("the bus is available again");
     let client = client(&bench.place);
     client.send(&[frame]).unwrap();
     assert_eq!(pty.peer.receives(1), [frame]);
@@ -419,13 +419,13 @@ fn what_cannot_be_is_refused_in_one_line() {
     let _listener = UnixListener::bind(&socket).unwrap();
     let refused = |words: &str, code| bench.slcan(words).end().refusal(code).to_owned();
     let cannot = |what: &str, why: &str| {
-        format!("vcan-setup: cannot open {what}: {why}; with --wait it is opened when it is available")
+        format!("vcan-setup: cannot open {what}: {why}; with --wait, it is opened when it becomes available")
     };
     assert_eq!(refused("/dev/none", 1), cannot("/dev/none", "No such file or directory (os error 2)"));
     assert_eq!(refused("unix:/none", 1), cannot("unix:/none", "No such file or directory (os error 2)"));
     assert_eq!(refused("tcp:127.0.0.1:1", 1), cannot("tcp:127.0.0.1:1", "Connection refused (os error 111)"));
     let file = file.display().to_string();
-    assert_eq!(refused(&file, 1), format!("vcan-setup: cannot open {file}: it is no terminal"));
+    assert_eq!(refused(&file, 1), format!("vcan-setup: cannot open {file}: it is not a terminal"));
     let path = socket.display().to_string();
     assert_eq!(
         refused(&path, 1),
@@ -437,7 +437,7 @@ fn what_cannot_be_is_refused_in_one_line() {
     );
     assert_eq!(
         refused(&format!("{tty} --cell 1 --cell 2"), 2),
-        "vcan-setup: 2 --cell for 1 lines: give one for each line, or write /dev/ttyACM0,cell=12"
+        "vcan-setup: 2 --cell options for 1 lines: give one for each line, or write /dev/ttyACM0,cell=12"
     );
     assert!(refused("ttyACM0", 2).contains("\"ttyACM0\" is not a line: use a form such as /dev/ttyACM0"));
     assert!(
@@ -447,7 +447,7 @@ fn what_cannot_be_is_refused_in_one_line() {
     let bridge = bench.joined(&tty.to_string());
     assert_eq!(
         refused(&tty.to_string(), 1),
-        format!("vcan-setup: cannot open {tty}: another program uses it; stop that one first")
+        format!("vcan-setup: cannot open {tty}: another program uses it; stop that program first")
     );
     // A link to the same terminal is the same terminal.
     let link = bench.place.path("link");

@@ -138,11 +138,11 @@ fn cells_that_are_wired_otherwise_than_described_are_named() {
     assert_eq!(
         lines,
         [
-            "port 3 of cell 6 is wired to port 2 of cell 11 instead of port 2 of cell 10: move the plug, or \
-             change the description",
-            "port 3 of cell 7 is wired to port 2 of cell 10 instead of port 2 of cell 11: move the plug, or \
-             change the description",
-            "the wire from port 3 of cell 8 to port 2 of cell 12 does not work: check its plugs",
+            "port 3 of cell 6 is wired to port 2 of cell 11 instead of port 2 of cell 10: correct the \
+             wiring or the skin",
+            "port 3 of cell 7 is wired to port 2 of cell 10 instead of port 2 of cell 11: correct the \
+             wiring or the skin",
+            "the wire from port 3 of cell 8 to port 2 of cell 12 does not work: check its connectors",
         ]
     );
 }

@@ -232,7 +232,7 @@ fn one_bus_of_a_skin_is_shown_alone() {
     for (words, expected) in [
         ("view vcan1", "there is no file vcan1: name a skin (to show its buses), a recording, or a bus"),
         ("view vcan7 --skin skin.toml", "bus vcan7 is not in skin.toml, which has vcan0, vcan1"),
-        ("view vcan1 --skin skin.toml --at 3", "--at is for a recording, not for live buses"),
+        ("view vcan1 --skin skin.toml --at 3", "--at is only for a recording, not for live buses"),
     ] {
         let ended = place.start("skinbus", &format!("{words} --bus-kind embedded")).end();
         assert!(ended.refusal(2).contains(expected), "{words}: {}", ended.refusal(2));

@@ -49,8 +49,8 @@ fn a_page_kills_stops_and_restarts_cells() {
     assert!(run.cells().iter().all(|(_, nodes)| nodes != "5"));
     page.wait_for_snapshot("that it is silent", |it| it.cells[4].0 == 4);
     for (action, node, why) in [
-        ("kill", 5, "kill cell 5 on vcan0: its process is ended: restart starts it again"),
-        ("continue", 2, "continue cell 2 on vcan0: its process is running"),
+        ("kill", 5, "kill cell 5 on vcan0: the process has ended: restart it"),
+        ("continue", 2, "continue cell 2 on vcan0: the process is running"),
         ("stop", 200, "stop cell 200 on vcan0: the skin has no such cell"),
     ] {
         page.act(action, node);
@@ -75,7 +75,7 @@ fn a_page_kills_stops_and_restarts_cells() {
             "link down between cell 1 and cell 2 on vcan0: ",
         ),
         (r#""on":"bus","down":true,"bus":7"#, "the skin has no such bus"),
-        (r#""on":"bus","down":false,"bus":0"#, "bus vcan0 up: no command has brought it down"),
+        (r#""on":"bus","down":false,"bus":0"#, "bus vcan0 up: no command has taken it down"),
     ] {
         page.command(command);
         assert!(!page.answer(why), "{why}");
@@ -138,7 +138,7 @@ fn a_bus_that_a_page_takes_down_stays_down_until_it_takes_it_up() {
     assert!(run.stderr().contains(&format!("the robot is halted: {};", why(&said).unwrap())), "{said}");
     assert!(!served(), "it is not served again by itself");
     page.command(r#""on":"bus","down":true,"bus":0"#);
-    assert!(!page.answer("no command has brought it up"));
+    assert!(!page.answer("it is already down"));
 
     page.command(r#""on":"bus","down":false,"bus":0"#);
     assert!(page.answer("bus vcan0 up"));
@@ -232,7 +232,7 @@ fn a_link_that_a_page_takes_down_leaves_a_cell_unreachable() {
     page.command(&link(true, 4, 3));
     page.command(&link(true, 8, 4));
     run.wait_for_stderr("view: link down between cell 4 and cell 3 on vcan0");
-    run.wait_for_stderr("cell 4 on vcan0 is unreachable");
+    run.wait_for_stderr("cell 4 on vcan0 has had no route to a root for ");
     let down = json!([{ "bus": 0, "nodes": [3, 4] }, { "bus": 0, "nodes": [4, 8] }]);
     page.wait_for_status("both links", |said| said["bench"]["links_down"] == down);
     page.command(&link(false, 3, 4));
@@ -267,7 +267,7 @@ fn a_server_that_hangs_or_ends_does_not_hold_the_run_up() {
     assert!(page.answer("bus vcan0 down"));
     signal(server, Signal::KILL);
     run.wait_for_stderr(
-        "--view: the process that served the page has ended; the run goes on without a page\n",
+        "--view: the process that served the page has ended; the run continues without the page\n",
     );
     run.wait_for_stderr("the process that served vcan0 ended (exit status: 0); a new process serves it");
     run.wait_for_stderr("vcan0 works again");

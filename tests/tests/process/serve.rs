@@ -400,7 +400,7 @@ fn clients_for_which_there_is_no_file_are_turned_away_and_the_others_go_on() {
     let mut said = String::new();
     server.stderr.take().unwrap().read_to_string(&mut said).unwrap();
     assert!(
-        said.starts_with("vcan-setup: vcan0: turned away ") && said.contains("no file descriptor of 64"),
+        said.starts_with("vcan-setup: vcan0: rejected ") && said.contains("no file descriptor of 64"),
         "{said}"
     );
     assert_eq!(ended(server, &parent).code(), Some(0));

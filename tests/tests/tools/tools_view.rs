@@ -198,13 +198,13 @@ fn a_click_on_why_of_a_moving_list_explains_and_a_halt_says_what_to_press() {
         );
         browser.mouse("mouseReleased", pressed);
         // On a busy machine the frame may be too old by now, which the page reports.
-        let said =
-            browser.until("/^Why, epoch|^No answer/.exec(document.getElementById('why').textContent)?.[0]");
+        let said = browser
+            .until("/^Explanation, epoch|^No answer/.exec(document.getElementById('why').textContent)?.[0]");
         browser.until(
             "(() => { const box = document.getElementById('why').getBoundingClientRect(); \
              return box.top >= 0 && box.bottom <= innerHeight; })()",
         );
-        answered += u32::from(said == "Why, epoch");
+        answered += u32::from(said == "Explanation, epoch");
         if answered == 2 {
             break;
         }

@@ -107,7 +107,7 @@ fn an_interface_that_is_removed_and_made_again_is_opened_again() {
     let bench = run(&place);
     let cells = bench.cells();
     let removed =
-        |name: &str| format!("{name} was removed while it was in use: make it again and open it again");
+        |name: &str| format!("{name} was removed while it was in use: create it again, then open it again");
     vcan2.remove();
     bench.wait_for_stderr(&format!("{}; the other buses continue", removed("vcan2")));
     vcan1.remove();

@@ -67,7 +67,7 @@ fn goes_on_when_reported(place: &TestDir, bench: &Running, cells: &[(Pid, String
             if heartbeat.state.has(State::HALTED))
     });
     place.start("skinbus", "frame resume --bus vcan0 --bus-kind socketcan").end().succeeded();
-    bench.wait_for_stderr("the robot goes on");
+    bench.wait_for_stderr("the robot continues");
     all_answer(place);
     assert_eq!(bench.cells(), cells, "no cell was restarted");
 }
@@ -126,7 +126,7 @@ fn a_bus_that_goes_down_halts_the_robot_and_works_again_when_it_is_up() {
     for cell in 1..=6 {
         bench.wait_for_event(cell, "come back");
     }
-    assert!(!bench.stderr().contains("the robot goes on"), "{}", bench.stderr());
+    assert!(!bench.stderr().contains("the robot continues"), "{}", bench.stderr());
     goes_on_when_reported(&place, &bench, &cells);
     assert_eq!(bench.stderr().matches("works again").count(), 1, "{}", bench.stderr());
     ends_well_after_a_pause(&place, bench);
@@ -181,7 +181,7 @@ fn cells_alone_outlive_a_bus_that_goes_down() {
 fn an_interface_that_is_removed_ends_the_run_with_one_line_and_the_log_is_kept() {
     let place = prepare();
     place.write("skin.toml", &small_skin(CELLS).replace("vcan0", "vcan5"));
-    let removed = "vcan5 was removed while it was in use: make it again and open it again";
+    let removed = "vcan5 was removed while it was in use: create it again, then open it again";
     let vcan5 = Vcan::make("vcan5");
     let bench = place.running_bench(600.0, "");
     vcan5.remove();
@@ -324,7 +324,8 @@ fn a_second_gateway_is_refused_and_the_first_is_undisturbed() {
     let second = "run skin.toml --scenario scenario.toml --duration 1 --summary second.json --candump second.log --overwrite --quiet";
     for more in ["", " --no-spawn"] {
         let ended = place.start("skinbus", &format!("{second}{more}")).end();
-        let said = "skinbus: another gateway is on vcan0: stop one of the two, or give this one another bus";
+        let said =
+            "skinbus: another gateway is on vcan0: stop one of the two, or run this one on another bus";
         assert_eq!(ended.refusal(1), said);
     }
     assert_eq!(place.files(), ["run.log", "scenario.toml", "second.json", "second.log", "skin.toml"]);

@@ -117,7 +117,7 @@ fn a_vcan_is_made_once_carries_fd_frames_and_is_removed() {
     assert_eq!(link("vcan20").unwrap()["ifindex"], first["ifindex"], "the same one");
     assert_eq!(done("down vcan20 vcan21"), "vcan20 is removed\nvcan21 is removed\n");
     assert_eq!(links("").len(), before);
-    assert_eq!(done("down vcan20"), "vcan20 is not there\n");
+    assert_eq!(done("down vcan20"), "vcan20 does not exist\n");
 }
 
 #[test]
@@ -167,21 +167,19 @@ fn what_is_not_ours_is_never_touched() {
     ip("link set vcan20 mtu 16");
     ip("link set vcan20 up");
     let before = links("");
+    let why = "vcan-setup did not make it and does not change it";
     let repairs = "sudo sh -c 'ip link set vcan20 down && ip link set vcan20 mtu 72 up'";
     assert_eq!(
         fails("up vcan21 vcan20", 1),
-        format!(
-            "vcan20 has MTU 16 and CAN FD needs 72; vcan-setup has not made it and leaves it alone: `{repairs}` fixes it"
-        )
+        format!("vcan20 has MTU 16 and CAN FD needs 72; {why}: `{repairs}` fixes it")
     );
     assert_eq!(
         fails("down vcan20", 2),
-        "vcan20 is a vcan that vcan-setup has not made, and is left alone: if it is yours, `sudo ip link del \
-         vcan20` removes it"
+        "vcan20 is a vcan that vcan-setup did not make, so it stays unchanged: if it is yours, `sudo ip link \
+         del vcan20` removes it"
     );
-    assert!(
-        fails("up vcan21 lo", 2).starts_with("lo is the loopback interface, which vcan-setup leaves alone")
-    );
+    let lo = fails("up vcan21 lo", 2);
+    assert!(lo.starts_with("lo is the loopback interface, which vcan-setup does not change"), "{lo}");
     assert_eq!(done("up vcan0"), "vcan0 already exists and is suitable (a vcan, made by another program)\n");
     let same = |links: Vec<Value>| -> Vec<_> {
         links
@@ -233,7 +231,8 @@ fn a_skins_buses_are_made_and_removed_and_what_others_made_stays() {
         assert!(about_buses.contains(&fine.as_str()), "{doctor:?}");
     }
     let said = done(&format!("down {path}"));
-    assert_eq!(said, "vcan0 is a vcan that vcan-setup has not made, and is left alone\nvcan20 is removed\n");
+    let kept = "vcan0 is a vcan that vcan-setup did not make, so it stays unchanged";
+    assert_eq!(said, format!("{kept}\nvcan20 is removed\n"));
     assert!(link("vcan0").is_some() && link("vcan20").is_none());
 }
 
@@ -394,7 +393,7 @@ fn who_is_not_root_is_told_so_and_may_look() {
     assert!(said.out.contains("fault there is no interface vcan77\n        sudo "), "{said:?}");
     let namespace = run_as(65_534, "up vcan21 --peer vcan22 --namespace /proc/1/ns/net");
     assert!(
-        namespace.err.starts_with("vcan-setup: not allowed to look into the network namespace"),
+        namespace.err.starts_with("vcan-setup: not allowed to enter the network namespace"),
         "{namespace:?}"
     );
 }
@@ -494,7 +493,7 @@ fn the_doctor_finds_what_is_wrong_and_its_hints_repair_it() {
     }
     let (code, faults) = doctor("lo");
     assert!(
-        code == 1 && faults[0].starts_with("lo is the loopback interface, which carries no CAN"),
+        code == 1 && faults[0].starts_with("lo is the loopback interface, which does not carry CAN"),
         "{faults:?}"
     );
 }

@@ -44,10 +44,12 @@ fn a_line_is_a_participant_of_a_vcan() {
     assert_eq!(received, frames);
 
     tool("ip link set vcan0 down");
-    bridge.wait_for_stderr("its bus is unavailable (vcan0 is down");
+    bridge.wait_for_stderr("the bus is unavailable (vcan0 is down");
     all.peer.sends(&frames[..1]);
     tool("ip link set vcan0 up");
-    until("both to be back", || (bridge.stderr().matches("its bus is back").count() == 2).then_some(()));
+    until("both to be back", || {
+        (bridge.stderr().matches("the bus is available again").count() == 2).then_some(())
+    });
     let bus = open();
     bus.send(&frames[..1]).unwrap();
     assert_eq!(all.peer.receives(2 * frames.len() + 1)[2 * frames.len()..], frames[..1]);

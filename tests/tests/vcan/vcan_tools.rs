@@ -153,7 +153,7 @@ fn cansend_halts_the_cells_and_ack_lets_them_go_on() {
         joints.get() == 10
     });
     place.start("skinbus", "frame resume --bus vcan0 --bus-kind socketcan").end().succeeded();
-    bench.wait_for_stderr("the robot goes on");
+    bench.wait_for_stderr("the robot continues");
     let test_client = place.test_client();
     for cell in 1..=4 {
         test_client.waits_for("torques again", torque_of(cell, true));

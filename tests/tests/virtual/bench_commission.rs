@@ -358,7 +358,7 @@ fn flash_that_cannot_be_written_is_named_and_the_old_remains() {
     workshop.pieces[6].worn = true;
     let report = workshop.commission(&skin, WISH, None);
     let Outcome::Failed(reason) = report.cells[6].outcome else { panic!("{report:#?}") };
-    assert_eq!(reason.to_string(), "refuses a commit: flash could not be written");
+    assert_eq!(reason.to_string(), "refused a commit: flash could not be written");
     assert_eq!(
         (workshop.pieces[6].flash, workshop.holding(new)),
         (FlashState::Valid(old(6)), usize::from(CELLS) - 1)
@@ -389,7 +389,7 @@ fn a_pose_that_came_wrong_is_refused_at_the_commit_and_the_old_one_stays() {
     let report = workshop.commission(&skin, WISH, None);
     for cell in &report.cells {
         let Outcome::Failed(reason) = cell.outcome else { panic!("{cell:?}") };
-        assert_eq!(reason.to_string(), "refuses a commit: the hash is not that of the staged copy");
+        assert_eq!(reason.to_string(), "refused a commit: the hash is not that of the staged copy");
     }
     assert!(
         workshop
@@ -446,7 +446,10 @@ fn wrong_words_are_written_again_and_named_in_the_end() {
     workshop.forgers = Some((|packet| packet, liar));
     let report = workshop.commission(&skin, WISH, None);
     let Outcome::Failed(reason) = report.cells[4].outcome else { panic!("{report:#?}") };
-    assert_eq!(reason.to_string(), "answers a read of timing with period 16001 us, not period 16000 us");
+    assert_eq!(
+        reason.to_string(),
+        "answered a read of timing with period 16001 us instead of period 16000 us"
+    );
     assert_eq!(outcomes(&report).iter().filter(|outcome| **outcome == Outcome::Written).count(), 11);
 }
 
@@ -467,5 +470,5 @@ fn a_refusal_is_named_in_words() {
     workshop.forgers = Some((|packet| packet, refuses));
     let report = workshop.commission(&skin, WISH, None);
     let Outcome::Failed(reason) = report.cells[4].outcome else { panic!("{report:#?}") };
-    assert_eq!(reason.to_string(), "refuses a write of pose: there is no such parameter");
+    assert_eq!(reason.to_string(), "refused a write of pose: there is no such parameter");
 }

@@ -75,7 +75,10 @@ fn without_a_restart_what_shows_only_at_a_start_is_not_tested() {
     assert_eq!(failed, [""; 0], "{}", failures(&findings));
     let untested: Vec<_> = findings
         .iter()
-        .filter(|it| matches!(&it.verdict, Verdict::NotTested { why } if why == "without --restart"))
+        .filter(|it| {
+            let expected = "the test needs the option --restart COMMAND";
+            matches!(&it.verdict, Verdict::NotTested { why } if why == expected)
+        })
         .map(|it| it.requirement.id)
         .collect();
     assert_eq!(untested, ["ID-3", "CLAIM-1", "CLAIM-2", "CLAIM-3", "CLAIM-4", "CLAIM-5", "CONF-8"]);
@@ -152,18 +155,22 @@ fn cells_with_less_pass() {
 fn a_cell_without_a_single_packet_is_named_with_its_mistake() {
     type Put = fn(&mut wrong::Memory, &Packet, Format) -> Vec<Frame>;
     let all: [(&str, Format, Put); 5] = [
-        ("its CRC has the high byte first", Format::Fd, |_, packet, format| {
+        ("the cell sends the CRC with the high byte first", Format::Fd, |_, packet, format| {
             spoilt(packet, format, |_, crc| crc.swap_bytes())
         }),
-        ("its CRC leaves out the identifier", Format::Fd, |_, packet, format| {
+        ("the cell computes the CRC without the identifier", Format::Fd, |_, packet, format| {
             spoilt(packet, format, |body, _| protocol::packet::crc16(&body[2..]))
         }),
-        ("its CRC has the identifier with the high byte first", Format::Classic, |_, packet, format| {
-            spoilt(packet, format, |body, _| {
-                protocol::packet::crc16(&[&[body[1], body[0]], &body[2..]].concat())
-            })
-        }),
-        ("its segments come in the wrong order", Format::Classic, |_, packet, format| {
+        (
+            "the cell computes the CRC with the high byte of the identifier first",
+            Format::Classic,
+            |_, packet, format| {
+                spoilt(packet, format, |body, _| {
+                    protocol::packet::crc16(&[&[body[1], body[0]], &body[2..]].concat())
+                })
+            },
+        ),
+        ("the cell sends the segments in the wrong order", Format::Classic, |_, packet, format| {
             packet.frames(format).collect::<Vec<_>>().into_iter().rev().collect()
         }),
         ("docs/reference/protocol.md", Format::Classic, |_, packet, format| {
@@ -177,7 +184,7 @@ fn a_cell_without_a_single_packet_is_named_with_its_mistake() {
         let survey = Survey::listen(&mut bus, "vcan0").unwrap();
         let cell = CellId::new(mutants::NODE.into()).unwrap();
         let why = survey.check_cell(cell, "vcan0", None, false).unwrap_err();
-        assert!(why.starts_with("cell 12 on vcan0 fails SEND-1: none of "), "{why}");
+        assert!(why.starts_with("cell 12 on vcan0 fails requirement SEND-1: none of "), "{why}");
         assert!(
             why.contains("is a valid packet, for example 40C#") && why.contains(mistake),
             "{mistake}: {why}"

@@ -136,7 +136,7 @@ fn unknown_causes_are_named_and_not_guessed() {
     assert!(matches!(cell(one).force.unwrap().origin, ContactOrigin::Stimulus { from_epoch: None, .. }));
     let said = explanation.missing.join("\n");
     let unknown = format!(
-        "vcan0 {zero}: its contact state is not in the capture: no stimulus, start or sensors page of this cell"
+        "vcan0 {zero}: its contact state is not in the capture: the capture has no earlier start, stimulus or sensors page of this cell"
     );
     assert!(said.contains(&unknown), "{said}");
     assert!(
@@ -154,7 +154,7 @@ fn unknown_causes_are_named_and_not_guessed() {
     assert!(cell.force.is_some() && cell.answered_after_ns.is_none());
     let said = explanation.missing.join("\n");
     assert!(
-        said.contains(&format!("vcan0 {one}: no torque of this epoch arrived in time: it was")),
+        said.contains(&format!("vcan0 {one}: no torque of this epoch arrived in time: the frame was lost")),
         "{said}"
     );
     assert_eq!(explanation.total[0].open, 1);
@@ -177,7 +177,8 @@ fn a_cell_that_has_just_started_sends_nothing_and_one_that_releases_sends_zeros(
     // Its stimulus was sent again, and it answers nothing during its address claim.
     assert!(cell(0).unwrap().answered_after_ns.is_some() && cell(2).unwrap().answered_after_ns.is_none());
     let why = format!(
-        "vcan0 {}: no torque of this epoch arrived in time: it had just started and was claiming its node id; the sum of received words does not include it",
+        "vcan0 {}: no torque of this epoch arrived in time: the cell had just started and was claiming its node id; \
+         the sum of received words does not include it",
         node(2)
     );
     assert_eq!(explanation.missing, [why]);

@@ -34,20 +34,22 @@ impl fmt::Display for LinkEvent {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Joined(host) => write!(f, "host '{host}' has joined"),
-            Self::Gone(host) => write!(f, "host '{host}' is gone or cannot be reached"),
+            Self::Gone(host) => write!(f, "host '{host}' has left or cannot be reached"),
             Self::Transport(what) => f.write_str(what),
-            Self::BusAway(why) => write!(f, "the bus is unavailable ({why}); it is opened when it is available"),
-            Self::BusBack => f.write_str("the bus is back"),
-            Self::Garbage(host, why) => write!(f, "host '{host}' sent {why}"),
+            Self::BusAway(why) => {
+                write!(f, "the bus is unavailable ({why}); it is opened when it becomes available")
+            }
+            Self::BusBack => f.write_str("the bus is available again"),
+            Self::Garbage(host, why) => write!(f, "host '{host}' sent invalid data: {why}"),
             Self::Circle => f.write_str(
-                "frames of other hosts come back from this bus and are not sent once more: something else joins the buses too, \
-                 such as a second link or an adapter; take one of them away",
+                "frames of other hosts return from this bus and are not sent again: something else joins the \
+                 buses too, such as a second link or an adapter; remove one of them",
             ),
             Self::SameName(host) => {
                 write!(f, "two hosts have the name '{host}': give each its own name with --host")
             }
             Self::Lost { from_here, from_others } => {
-                write!(f, "lost: {from_here} frames from here, {from_others} from other hosts")
+                write!(f, "lost: {from_here} frames from this host, {from_others} from other hosts")
             }
         }
     }

@@ -78,7 +78,7 @@ fn json(report: &LinkReport) -> Result<String, Failure> {
 fn text(report: &LinkReport) -> String {
     let LinkReport { sent, hosts, returned, .. } = report;
     let mut text = format!(
-        "from here: {} frames read, {} sent in {} messages, {} dropped, {} missed\n",
+        "from this host: {} frames read, {} sent in {} messages, {} dropped, {} missed\n",
         sent.taken, sent.sent, sent.messages, sent.dropped, sent.missed
     );
     for (host, HostReport { heard, .. }) in hosts {
@@ -94,7 +94,7 @@ fn text(report: &LinkReport) -> String {
     }
     if *returned > 0 {
         text += &format!(
-            "{returned} frames of other hosts came back from the bus here, and were not sent again\n"
+            "{returned} frames of other hosts returned from the bus of this host, and were not sent again\n"
         );
     }
     text

@@ -236,7 +236,7 @@ fn set_unless_given(config: &mut Config, key: &str) -> Result<(), LinkError> {
 pub(crate) fn key(what: &str, bus: &str, host: &str) -> Result<KeyExpr<'static>, LinkError> {
     for name in [bus, host] {
         if name != "*" && name.contains(['*', '$', '?', '#', '/']) {
-            let why = "it has one of * $ ? # /".to_owned();
+            let why = "it contains one of * $ ? # /".to_owned();
             return Err(LinkError::Name(name.to_owned(), why));
         }
     }

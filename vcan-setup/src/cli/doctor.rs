@@ -14,7 +14,7 @@ use super::{buses_from_arguments, query_interfaces, to_json};
 /// Check whether a bench would run on this machine, with a hint for each fault
 ///
 /// Checks the kernel, interfaces, permissions, buffers, and the nodes that are already on the buses (it listens for
-/// 600 ms, and sends nothing), and reports what would stop `skinbus run`. Changes nothing. Run it as the user
+/// 600 ms, and sends nothing), and reports what would prevent `skinbus run`. Changes nothing. Run it as the user
 /// who runs the gateway. Exit code 0: a bench would run; 1: it would not; 2: wrong use.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
@@ -28,7 +28,7 @@ pub(crate) struct DoctorOptions {
     what: Vec<OsString>,
     #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto, help = BusKind::help())]
     bus_kind: KindChoice,
-    /// Expect cells that are already running, or real ones, as `skinbus run --no-spawn` does
+    /// Expect cells that are already on the buses, real or simulated, as `skinbus run --no-spawn` does
     #[arg(long)]
     no_spawn: bool,
     /// Print JSON

@@ -24,7 +24,7 @@ use vcan_setup::link::Interface;
 use vcan_setup::netlink::Netlink;
 use vcan_setup::plan::InterfaceTarget;
 
-/// Sets up CAN buses: makes vcan interfaces, checks what a bench still needs, serves embedded buses
+/// Set up CAN buses: make vcan interfaces, check what a bench still needs, serve embedded buses
 #[derive(Debug, Parser)]
 #[command(
     version,

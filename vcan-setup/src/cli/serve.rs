@@ -24,7 +24,7 @@ const HIGHEST_PRIORITY: i32 = -20;
     after_help = "Examples:\n  vcan-setup serve vcan0\n  sleep 10 | vcan-setup serve vcan0 --until-eof"
 )]
 pub(crate) struct ServeBusOptions {
-    /// The bus's name, as an interface's: at most 15 bytes
+    /// Name of the bus, like that of an interface: at most 15 bytes
     #[arg(value_parser = parse_bus_name)]
     name: String,
     /// Also stop when standard input ends or the parent process dies
@@ -47,23 +47,24 @@ fn format_with_causes(error: &anyhow::Error) -> String {
 }
 
 fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
-    let (stop, stopped) = UnixStream::pair().context("cannot make a handle to stop")?;
+    let (stop, stopped) =
+        UnixStream::pair().context("cannot create the socket pair that stops the server")?;
     for signal in [SIGINT, SIGTERM] {
-        let stop = stop.try_clone().context("cannot make a handle to stop")?;
+        let stop = stop.try_clone().context("cannot create the socket pair that stops the server")?;
         signal_hook::low_level::pipe::register(signal, stop).context("cannot catch signals")?;
     }
     if until_eof {
         // The signal is sent when the thread ends that started this process, because the system regards it as the
         // parent.
         rustix::process::set_parent_process_death_signal(Some(Signal::TERM))
-            .context("cannot follow the parent process")?;
+            .context("cannot watch the parent process")?;
         let follow = move || {
             let _ = std::io::copy(&mut std::io::stdin().lock().by_ref(), &mut std::io::sink());
             let _ = (&stop).write_all(b"end");
         };
         std::thread::Builder::new()
             .spawn(follow)
-            .context("cannot start a thread to follow standard input")?;
+            .context("cannot start a thread that reads standard input")?;
     }
     // The kernel delivers frames at once, but a server process may wait behind hundreds of cells for processor time. If
     // this process may not raise its priority, the bus is only slower.
@@ -86,8 +87,8 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
         let limit =
             getrlimit(Resource::Nofile).current.map_or_else(String::new, |limit| format!(" of {limit}"));
         print_to_stderr(&format!(
-            "{name}: turned away {turned_away} clients, because no file descriptor{limit} or memory was left: end other clients, or \
-             raise `ulimit -Hn`"
+            "{name}: rejected {turned_away} clients, because no file descriptor{limit} or memory was left: \
+             end other clients, or raise `ulimit -Hn`"
         ));
     }
     if let Some(failure) = failure {

@@ -28,15 +28,15 @@ use super::{parse_bus_name, to_json};
   vcan-setup slcan vcan0 unix:/tmp/12.sock,cell=12 unix:/tmp/13.sock,cell=13 --wait
   vcan-setup slcan vcan0 /dev/ttyUSB0,cell=12,baud=57600,classic --bit-rates 500k
 
-docs/how-to/adapters.md says which adapters speak slcan.")]
+docs/how-to/adapters.md lists adapters that support slcan.")]
 pub(crate) struct SlcanOptions {
-    /// The bus
+    /// Name of the bus
     #[arg(value_parser = parse_bus_name)]
     bus: String,
-    /// The lines: PATH, unix:PATH or tcp:HOST:PORT, followed by options after commas
+    /// Serial lines: PATH, unix:PATH or tcp:HOST:PORT, each followed by its options after commas
     #[arg(value_name = "LINE", required = true)]
     lines: Vec<LineOptions>,
-    /// The cell behind each LINE, in the order of the lines
+    /// Node id of the cell behind each LINE, in the order of the lines
     #[arg(long, value_name = "N", value_parser = parse_cell_id)]
     cell: Vec<CellId>,
     /// Bit rates to set in the adapters, such as 500k or 1M/5M [default: unchanged]
@@ -45,13 +45,13 @@ pub(crate) struct SlcanOptions {
     /// Speed of the terminals in bit/s [default: unchanged]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     baud: Option<u32>,
-    /// The adapters have no CAN FD: drop FD frames
+    /// Drop FD frames, because the adapters have no CAN FD
     #[arg(long)]
     classic: bool,
-    /// Seconds to wait between opening a line and setting its adapter, for boards that opening resets (Arduino, ESP32)
+    /// Seconds to wait after a line is opened, for boards that are reset when it is opened (Arduino, ESP32)
     #[arg(long, value_name = "SECONDS", value_parser = parse_settle)]
     settle: Option<Duration>,
-    /// Begin without unavailable lines, and open them later
+    /// Start even if lines are unavailable, and open them later
     #[arg(long)]
     wait: bool,
     #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto, help = BusKind::help())]
@@ -62,7 +62,7 @@ pub(crate) struct SlcanOptions {
 }
 
 fn parse_cell_id(word: &str) -> Result<CellId, String> {
-    let number = word.parse().map_err(|_| "not a number".to_owned())?;
+    let number = word.parse().map_err(|_| "it must be a node id, 1 to 254".to_owned())?;
     CellId::new(number).map_err(|error| error.to_string())
 }
 
@@ -99,7 +99,7 @@ impl SlcanOptions {
         let noun = if count == 1 { "line" } else { "lines" };
         let mut ready = format!("{count} {noun} on {bus} ({kind})");
         if !away.is_empty() {
-            ready += &format!(", still away: {}", away.join(", "));
+            ready += &format!(", not open yet: {}", away.join(", "));
         }
         // With `--json`, standard output contains only the JSON.
         if self.json {
@@ -120,7 +120,7 @@ impl SlcanOptions {
         let mut lines = self.lines.clone();
         if !self.cell.is_empty() && self.cell.len() != lines.len() {
             return Err(Failure::usage_error(format!(
-                "{} --cell for {} lines: give one for each line, or write /dev/ttyACM0,cell=12",
+                "{} --cell options for {} lines: give one for each line, or write /dev/ttyACM0,cell=12",
                 self.cell.len(),
                 lines.len()
             )));

@@ -22,13 +22,13 @@ const ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// Show the CAN interfaces of this machine, and the embedded buses of this user
 ///
-/// Shows the bit rates and the error state of hardware too. Exit code 1 if a named one does not exist.
+/// Shows the bit rates and the error state of hardware too. Exit code 1 if a named bus does not exist.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vcan-setup status
   vcan-setup status skin.toml --json")]
 pub(crate) struct StatusOptions {
-    /// Show only these: names, or skin files, which end in .toml or contain a '/'
+    /// Show only these buses: names, or skin files, which end in .toml or contain a '/'
     #[arg(value_name = "SKIN.toml|NAME")]
     what: Vec<OsString>,
     /// Print JSON
@@ -55,7 +55,9 @@ impl StatusOptions {
                 to_json(&StatusReport { interfaces, embedded: &embedded, links: &links })?
             }
             (false, false) => format_table(&interfaces, &embedded) + &format_link_reports(&links),
-            (false, true) if target.is_empty() => "no CAN interface, no embedded bus\n".to_owned(),
+            (false, true) if target.is_empty() => {
+                "there is no CAN interface and no embedded bus\n".to_owned()
+            }
             // If a named bus does not exist, an error reports it below.
             (false, true) => String::new(),
         };
@@ -92,7 +94,7 @@ fn query_link_reports<'a>(
 fn format_link_reports(links: &BTreeMap<&str, hosts::LinkReport>) -> String {
     let host = |(name, host): (&String, &hosts::HostReport)| {
         let cells = host.nodes.len();
-        let gone = if host.is_there { "" } else { ", not reached" };
+        let gone = if host.is_there { "" } else { ", unreachable" };
         format!("'{name}' ({cells} cell{}{gone})", if cells == 1 { "" } else { "s" })
     };
     let line = |(bus, report): (&&str, &hosts::LinkReport)| {
@@ -186,7 +188,7 @@ fn frame_format_text(interface: &Interface) -> String {
 
 fn bit_rates_text(interface: &Interface) -> String {
     match interface.kind {
-        InterfaceKind::Hardware(CanHardware { bitrate: None, .. }) => "none set".to_owned(),
+        InterfaceKind::Hardware(CanHardware { bitrate: None, .. }) => "not set".to_owned(),
         InterfaceKind::Hardware(CanHardware { bitrate, data_bitrate, .. }) => {
             HardwareRates { bitrate, data_bitrate }.to_string()
         }

@@ -19,17 +19,17 @@ use super::{BusArgument, parse_argument, query_error, query_interfaces, targets_
 
 /// Make virtual CAN interfaces, and bring them up
 ///
-/// Makes missing interfaces with MTU 72 for CAN FD, and marks them with the alias "skinbus". Interfaces that exist
-/// and fit stay as they are, so the command may be repeated. It changes only interfaces that it has made: of a real
-/// interface in a skin it only checks the bit rates, unless --set-bit-rates is given. Needs root, unless all
-/// interfaces are in place.
+/// Makes missing interfaces with MTU 72 for CAN FD, and marks them with the alias "skinbus". Suitable interfaces that
+/// exist stay unchanged, so the command may be repeated. It changes only interfaces that it has made. For a real
+/// interface in a skin, it only checks the bit rates, unless --set-bit-rates is given. Needs root, unless there is
+/// nothing to change.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vcan-setup up --dry-run skin.toml                           print what would be done
   sudo vcan-setup up skin.toml                                all buses of a skin
   sudo vcan-setup up vcan0 vcan1
   sudo vcan-setup up vcan0 --peer vcan0 --namespace blue      a pair that leads into a namespace
-  sudo vcan-setup up skin.toml --set-bit-rates                and set those of real interfaces")]
+  sudo vcan-setup up skin.toml --set-bit-rates                also set the bit rates of real interfaces")]
 pub(crate) struct UpOptions {
     /// Names of interfaces, or skin files, which end in .toml or contain a '/'
     #[arg(required = true, value_name = "SKIN.toml|NAME")]
@@ -40,7 +40,7 @@ pub(crate) struct UpOptions {
     /// Make a vxcan pair: NAME is one end, PEER the other
     #[arg(long, value_name = "PEER")]
     peer: Option<String>,
-    /// The network namespace of the other end: a name, a path, or a process id
+    /// Network namespace of the other end: a name, a path, or a process id
     #[arg(long, value_name = "NAME|PATH|PID", requires = "peer")]
     namespace: Option<OsString>,
     /// Set the bit rates of CAN hardware to those of the skin; takes the interface down for a moment
@@ -50,8 +50,8 @@ pub(crate) struct UpOptions {
 
 /// Remove the virtual CAN interfaces that `up` has made
 ///
-/// Removes only interfaces with the alias "skinbus". Other buses of a skin are left alone, but naming such an
-/// interface is an error.
+/// Removes only interfaces with the alias "skinbus". Other interfaces of a skin stay unchanged, but naming one on the
+/// command line is an error.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   sudo vcan-setup down skin.toml
@@ -81,7 +81,7 @@ impl UpOptions {
 
     fn make_pair(&self, peer: &str) -> Result<(), Failure> {
         let [given] = self.what.as_slice() else {
-            return Err(Failure::usage_error("--peer makes one pair: give one NAME with it"));
+            return Err(Failure::usage_error("--peer makes one pair of interfaces: give exactly one NAME"));
         };
         let BusArgument::Name(name) = parse_argument(given)? else {
             return Err(Failure::usage_error(format!(
@@ -121,7 +121,7 @@ fn check_plain_name(name: &str) -> Result<(), Failure> {
     super::parse_bus_name(name).map_err(Failure::usage_error)?;
     if !is_plain_name(name) || name.starts_with(['-', '.']) {
         return Err(Failure::usage_error(format!(
-            "{name:?} is not allowed as a name of an interface: use letters, digits, '-', '_' and '.', as in vcan0"
+            "{name:?} is not a valid name of an interface: use letters, digits, '-', '_' and '.', as in vcan0"
         )));
     }
     Ok(())
@@ -130,7 +130,7 @@ fn check_plain_name(name: &str) -> Result<(), Failure> {
 /// Opens the network namespace that an argument names. Returns `None` if that is the current one.
 fn open_namespace(word: &OsStr) -> Result<Option<(Namespace, File, Netlink)>, Failure> {
     let namespace = Namespace::parse(word);
-    let not_allowed = || permission_error(&format!("look into the network namespace {namespace}"));
+    let not_allowed = || permission_error(&format!("enter the network namespace {namespace}"));
     let denied = |error: &NamespaceError| matches!(error, NamespaceError::Io { source, .. } if source.kind() == io::ErrorKind::PermissionDenied);
     let file = namespace
         .open()
@@ -147,10 +147,13 @@ fn open_namespace(word: &OsStr) -> Result<Option<(Namespace, File, Netlink)>, Fa
         match Errno::from_io_error(&error) {
             Some(Errno::PERM) => not_allowed(),
             Some(Errno::INVAL) => Failure::usage_error(format!(
-                "{} is not a network namespace: name one that `ip netns` lists, a process, or a file like /proc/1/ns/net",
+                "{} is not a network namespace: give a name that `ip netns` lists, a process id, or a file \
+                 like /proc/1/ns/net",
                 path.display()
             )),
-            _ => Failure::run_error(format!("cannot enter the network namespace {}: {error}", path.display())),
+            _ => {
+                Failure::run_error(format!("cannot enter the network namespace {}: {error}", path.display()))
+            }
         }
     })?;
     Ok(Some((namespace, file, inside)))
@@ -203,7 +206,7 @@ impl PlanRunner<'_> {
                     for done in undo.iter().rev() {
                         if let Err(error) = self.netlink.undo(done) {
                             failure =
-                                failure.append(format_args!("taking back what was done fails: {error}"));
+                                failure.append(format_args!("undoing the earlier steps failed: {error}"));
                         }
                     }
                     return Err(failure);
@@ -246,7 +249,8 @@ fn explain_step_failure(step: &Step, error: &io::Error) -> Failure {
     let data = if let StepAction::SetRates { rates, .. } = step.action { rates.data_bitrate } else { None };
     match (Errno::from_io_error(error), kind) {
         (Some(Errno::OPNOTSUPP), None) if data.is_some() => Failure::run_error(format!(
-            "cannot {doing}: this hardware has no CAN FD; give the bus format = \"classic\", without data_bitrate"
+            "cannot {doing}: this hardware has no CAN FD; in the skin, set format = \"classic\" for the bus \
+             and remove data_bitrate"
         )),
         (Some(Errno::OPNOTSUPP), Some(kind)) => unknown(kind, &Kernel::detect()),
         (Some(Errno::PERM | Errno::ACCESS), kind) => {

@@ -20,29 +20,30 @@ impl MachineFacts {
         findings.extend(match self.kernel.vcan {
             ModuleState::Available => None,
             ModuleState::Unknown => {
-                let text = "cannot see whether the kernel has vcan; if it has none:";
+                let text = "it is unknown whether the kernel supports vcan; if it does not:";
                 Some(Finding::note(text).with_hints(hints))
             }
             ModuleState::Loadable => {
-                let text = "the kernel's module vcan is not loaded; making an interface loads it";
+                let text = "the kernel module vcan is not loaded; making an interface loads it";
                 Some(Finding::note(text).with_hint(self.with_sudo("modprobe vcan")))
             }
             ModuleState::Missing => {
-                let text = format!("the kernel ({}) has CAN but no vcan", self.kernel.release);
+                let text = format!("the kernel ({}) supports CAN, but not vcan", self.kernel.release);
                 Some(Finding::fault(text).with_hints(hints))
             }
         });
         findings.extend(match self.user {
             User { admin: true, .. } => None,
             User { root: false, .. } => {
-                Some(Finding::note("this user may not make interfaces, hence the sudo below"))
+                Some(Finding::note("this user may not make interfaces, so the commands below use sudo"))
             }
             User { root: true, .. } => Some(
                 Finding::fault(
                     "root may not make interfaces here: it has no CAP_NET_ADMIN, as in most containers",
                 )
                 .with_hint(
-                    "docker run --cap-add NET_ADMIN ...  # or make the interface outside, in this network",
+                    "docker run --cap-add NET_ADMIN ...  # or make the interface outside, in the container's \
+                     network namespace",
                 ),
             ),
         });
@@ -72,10 +73,13 @@ impl MachineFacts {
         let is_served = !matches!(bus.traffic, Ok(None));
         Some(match (self.no_spawn, is_served) {
             (false, _) => Finding::note(format!(
-                "there is no interface {name}: a run that starts its cells makes an embedded bus; for SocketCAN:"
+                "there is no interface {name}, so a run that starts its cells uses an embedded bus; for \
+                 SocketCAN:"
             ))
             .with_hint(up),
-            (true, true) => Finding::ok(format!("there is no interface {name}, but an embedded bus of this name runs")),
+            (true, true) => Finding::ok(format!(
+                "there is no interface {name}, but an embedded bus of this name is served"
+            )),
             (true, false) => Finding::fault(format!(
                 "there is no interface {name}, and no embedded bus of this name is served"
             ))
@@ -96,15 +100,15 @@ impl MachineFacts {
             return vec![if bus.target.hardware().is_some() {
                 Finding::fault(text + ", and the skin gives it a bitrate, so it is hardware")
                     .with_hint("# plug it in and load its driver; `vcan-setup status` shows when it is there")
-                    .with_hint(up + "  # once bitrate is taken out of the skin: a vcan")
+                    .with_hint(up + "  # makes a vcan, after you have removed bitrate from the skin")
             } else {
                 Finding::fault(text).with_hint(up)
             }];
         };
         let mut findings = match &interface.kind {
             InterfaceKind::Other(what) => {
-                let text = format!("{name} is {what}, which carries no CAN");
-                return vec![Finding::fault(text).with_hint("# name another bus")];
+                let text = format!("{name} is {what}, which does not carry CAN");
+                return vec![Finding::fault(text).with_hint("# use another bus")];
             }
             InterfaceKind::Vcan | InterfaceKind::Vxcan(_) => self.virtual_faults(bus, interface),
             InterfaceKind::Hardware(hardware) => self.hardware_faults(bus, interface, hardware),
@@ -120,9 +124,9 @@ impl MachineFacts {
                     self.with_sudo("ip link del")
                 };
                 let text = format!(
-                    "{name} is {what} and has no bit rate; the skin gives it one, as if it were hardware"
+                    "{name} is {what}, which has no bit rate, but the skin specifies one, as for hardware"
                 );
-                let hint = format!("{command} {name}  # if hardware is to have this name");
+                let hint = format!("{command} {name}  # if this name belongs to hardware");
                 findings.push(Finding::note(text).with_hint(hint));
             }
             findings.extend(self.check_traffic(bus, name));
@@ -160,7 +164,8 @@ impl MachineFacts {
                     Format::Classic => "bitrate 1000000",
                 };
                 self.with_sudo(&format!(
-                    "sh -c 'ip link set {name} down; ip link set {name} up type can {rates}'  # or the rates of your bus"
+                    "sh -c 'ip link set {name} down; ip link set {name} up type can {rates}'  # with the bit \
+                     rates of your bus"
                 ))
             }
         };
@@ -174,7 +179,7 @@ impl MachineFacts {
             let classic = "format = \"classic\"  # in the skin";
             findings.push(Finding::fault(text).with_hint(set()).with_hint(classic));
         } else if !up {
-            findings.push(Finding::fault(format!("{name} is {what}, and down")).with_hint(set()));
+            findings.push(Finding::fault(format!("{name} is {what}, but down")).with_hint(set()));
         }
         if bus.sums {
             let text = format!(
@@ -188,36 +193,38 @@ impl MachineFacts {
             let off = "type can listen-only off";
             let hint =
                 self.with_sudo(&format!("sh -c 'ip link set {name} down; ip link set {name} up {off}'"));
-            let text = format!("{name} only listens: it can neither send nor acknowledge");
+            let text = format!("{name} is in listen-only mode: it can neither send nor acknowledge frames");
             findings.push(Finding::fault(text).with_hint(hint));
         }
         findings.extend(match hardware.state.filter(|_| *up) {
             Some(ControllerState::BusOff) => Some(
                 Finding::fault(format!(
-                    "{name} is BUS-OFF: it no longer takes part after too many errors; wiring, termination or bit \
-                     rates are wrong"
+                    "{name} is BUS-OFF: it left the bus after too many errors; correct the wiring, the \
+                     termination or the bit rates"
                 ))
                 .with_hint(self.with_sudo(&format!("ip link set {name} type can restart"))),
             ),
             Some(state @ (ControllerState::ErrorPassive | ControllerState::ErrorWarning)) => Some(
                 Finding::note(format!(
-                    "{name} is {}: it sees errors; is another node on the bus, terminated, at the same bit rates?",
+                    "{name} is {}: it detects errors; check that another node is on the bus, terminated, at \
+                     the same bit rates",
                     state.name()
                 ))
                 .with_hint(format!("ip -details -statistics link show {name}")),
             ),
-            Some(ControllerState::ErrorActive | ControllerState::Stopped | ControllerState::Sleeping) | None => None,
+            Some(ControllerState::ErrorActive | ControllerState::Stopped | ControllerState::Sleeping)
+            | None => None,
         });
         if would_bench_run(&findings) {
             findings.push(match skin {
                 Some(skin) if skin.rates.bitrate.is_some() => {
-                    Finding::ok(format!("{name} is at {has}, as the skin requires"))
+                    Finding::ok(format!("{name} runs at {has}, as the skin requires"))
                 }
                 Some(_) => Finding::note(format!(
-                    "{name} is at {has}; the skin states no bit rate to compare it with"
+                    "{name} runs at {has}; the skin does not specify a bit rate to compare"
                 ))
                 .with_hint("bitrate = ...  # under its [[bus]] in the skin"),
-                None => Finding::ok(format!("{name} is at {has}")),
+                None => Finding::ok(format!("{name} runs at {has}")),
             });
         }
         findings

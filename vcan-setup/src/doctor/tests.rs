@@ -135,18 +135,17 @@ fn a_machine_on_which_all_is_well() {
 fn no_can_in_the_kernel_matters_by_what_was_chosen() {
     assert_eq!(
         complaints(&no_can(KindChoice::Auto)),
-        [
-            "note: the kernel (6.1.0) has no CAN, so the bench runs on the embedded bus: no candump, no real cell; \
-          for a kernel with CAN: | sudo modprobe -a can_raw vcan vxcan | tests/lab/run COMMAND  # in the project's \
-          folder: runs it in a machine that has vcan"
-        ]
+        ["note: the kernel (6.1.0) does not support CAN, so the bench uses the embedded bus, without \
+             candump and real cells; to get a kernel with CAN: | sudo modprobe -a can_raw vcan vxcan | \
+             tests/lab/run COMMAND  # in the project's folder: runs COMMAND in a virtual machine that has \
+             vcan"]
     );
     assert_eq!(no_can(KindChoice::Auto).bus_kind(), BusKind::Embedded);
     assert_eq!(complaints(&no_can(KindChoice::Only(BusKind::Embedded))), Vec::<String>::new());
     let only = complaints(&no_can(KindChoice::Only(BusKind::SocketCan)));
-    assert!(
-        only[0].starts_with("fault: the kernel (6.1.0) has no CAN, and --bus-kind socketcan needs it | sudo")
-    );
+    assert!(only[0].starts_with(
+        "fault: the kernel (6.1.0) does not support CAN, which --bus-kind socketcan needs | sudo",
+    ));
     assert_eq!(only.len(), 1, "nothing is said of interfaces: {only:?}");
     let mut facts = no_can(KindChoice::Auto);
     facts.embedded = Err("/tmp/skinbus-1 has mode 0755".into());
@@ -164,8 +163,8 @@ fn hardware_of_a_skin_that_is_a_vcan_is_noted() {
         })
     };
     let text =
-        "note: vcan0 is a vcan and has no bit rate; the skin gives it one, as if it were hardware | sudo";
-    let why = "vcan0  # if hardware is to have this name";
+        "note: vcan0 is a vcan, which has no bit rate, but the skin specifies one, as for hardware | sudo";
+    let why = "vcan0  # if this name belongs to hardware";
     assert_eq!(note(true), [format!("{text} vcan-setup down {why}")]);
     assert_eq!(note(false), [format!("{text} ip link del {why}")]);
 }
@@ -182,7 +181,8 @@ fn a_bus_of_either_kind_that_is_absent_is_made_by_a_run_that_starts_its_cells() 
     assert_eq!(
         absent(false, None),
         [format!(
-            "note: {text}: a run that starts its cells makes an embedded bus; for SocketCAN: | sudo vcan-setup up skin.toml"
+            "note: {text}, so a run that starts its cells uses an embedded bus; for SocketCAN: | sudo \
+             vcan-setup up skin.toml"
         )]
     );
     assert_eq!(
@@ -209,7 +209,7 @@ fn a_missing_interface_is_made_by_up_and_who_may_not_needs_sudo() {
     assert_eq!(
         missing(anybody, ModuleState::Available),
         [
-            "note: this user may not make interfaces, hence the sudo below",
+            "note: this user may not make interfaces, so the commands below use sudo",
             "fault: there is no interface vcan0 | sudo vcan-setup up skin.toml",
         ]
     );
@@ -217,15 +217,15 @@ fn a_missing_interface_is_made_by_up_and_who_may_not_needs_sudo() {
         missing(admin, ModuleState::Available),
         ["fault: there is no interface vcan0 | vcan-setup up skin.toml"]
     );
-    let loadable =
-        "note: the kernel's module vcan is not loaded; making an interface loads it | modprobe vcan";
+    let loadable = "note: the kernel module vcan is not loaded; making an interface loads it | modprobe vcan";
     assert_eq!(missing(admin, ModuleState::Loadable)[0], loadable);
     assert!(
         missing(admin, ModuleState::Missing)[0]
-            .starts_with("fault: the kernel (6.1.0) has CAN but no vcan | ")
+            .starts_with("fault: the kernel (6.1.0) supports CAN, but not vcan | ")
     );
     assert!(
-        missing(admin, ModuleState::Unknown)[0].starts_with("note: cannot see whether the kernel has vcan")
+        missing(admin, ModuleState::Unknown)[0]
+            .starts_with("note: it is unknown whether the kernel supports vcan",)
     );
     let contained = missing(User { root: true, admin: false }, ModuleState::Available);
     assert!(contained[0].starts_with("fault: root may not make interfaces here: it has no CAP_NET_ADMIN"));
@@ -261,7 +261,7 @@ fn an_interface_that_does_not_fit_is_repaired_by_who_made_it() {
     );
     assert_eq!(
         about_interface(|it| it.kind = InterfaceKind::Other("a network interface (ether)".into())),
-        ["fault: vcan0 is a network interface (ether), which carries no CAN | # name another bus"]
+        ["fault: vcan0 is a network interface (ether), which does not carry CAN | # use another bus"]
     );
     let classic = about(|facts| {
         facts.buses[0].target.format = Format::Classic;
@@ -285,7 +285,7 @@ fn hardware_has_to_have_the_skins_bit_rates_and_to_take_part() {
     );
     assert_eq!(
         about_hardware(same, |can0, _| can0.up = false),
-        [format!("fault: can0 is CAN hardware (kvaser_pci), and down | {set}")]
+        [format!("fault: can0 is CAN hardware (kvaser_pci), but down | {set}")]
     );
     let open = |target: &mut InterfaceTarget| {
         let skin = target.skin.as_mut().unwrap();
@@ -293,7 +293,9 @@ fn hardware_has_to_have_the_skins_bit_rates_and_to_take_part() {
     };
     let unsaid = about_hardware(open, fine);
     assert_eq!(unsaid.len(), 1);
-    assert!(unsaid[0].starts_with("note: can0 is at 1000 kbit/s, data 5000 kbit/s; the skin states no"));
+    assert!(
+        unsaid[0].starts_with("note: can0 runs at 1000 kbit/s, data 5000 kbit/s; the skin does not specify",)
+    );
     let narrow = about_hardware(open, |can0, _| can0.mtu = CLASSIC_MTU);
     assert!(
         narrow[0].starts_with("fault: can0 is CAN hardware (kvaser_pci) with MTU 16, and CAN FD needs 72")
@@ -305,23 +307,23 @@ fn hardware_has_to_have_the_skins_bit_rates_and_to_take_part() {
             && bus_off[0].contains("sudo ip link set can0 type can restart")
     );
     assert!(
-        state(ControllerState::ErrorPassive)[0].starts_with("note: can0 is ERROR-PASSIVE: it sees errors")
+        state(ControllerState::ErrorPassive)[0].starts_with("note: can0 is ERROR-PASSIVE: it detects errors")
     );
     let deaf = about_hardware(same, |_, hardware| hardware.listen_only = true);
-    assert!(deaf[0].starts_with("fault: can0 only listens"));
+    assert!(deaf[0].starts_with("fault: can0 is in listen-only mode"));
 }
 
 #[test]
 fn another_gateway_and_cells_that_are_there_end_a_run_before_it_begins() {
     assert_eq!(
         listens(ObservedTraffic { gateway: true, ..ObservedTraffic::default() }, false),
-        [
-            "fault: another gateway sends joints on vcan0 | pgrep -a skinbus  # and stop it, or take another bus"
-        ]
+        ["fault: another gateway sends joints on vcan0 | pgrep -a skinbus  # shows the gateway: stop it, \
+             or use another bus"]
     );
     let there = listens(cells(1..=14), false);
     assert!(there[0].starts_with(
-        "fault: cells are on vcan0 already: 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12 and 2 more | skinbus run ... --no-spawn"
+        "fault: cells are already on vcan0: 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12 and 2 more | skinbus run \
+         ... --no-spawn"
     ));
     assert_eq!(listens(cells(1..=100), true), Vec::<String>::new());
     assert_eq!(
@@ -356,16 +358,16 @@ fn a_receive_buffer_holds_one_answer_at_least_and_should_hold_four() {
     assert_eq!(
         granted((400 << 10) - 1),
         [format!(
-            "note: receive buffers are limited to 399 KiB; to hold all answers (100 frames) 4 times, they need 400 \
-             KiB, else a delayed gateway loses answers | {hint}"
+            "note: receive buffers are limited to 399 KiB; to hold the answers of all cells (100 frames) 4 \
+             times, they need 400 KiB, otherwise a delayed gateway loses answers | {hint}"
         )]
     );
     assert!(granted(100 << 10)[0].starts_with("note"));
     assert_eq!(
         granted((100 << 10) - 1),
         [format!(
-            "fault: receive buffers are limited to 99 KiB and cannot hold all answers (100 frames) even once; 400 \
-             KiB are needed | {hint}"
+            "fault: receive buffers are limited to 99 KiB and cannot hold the answers of all cells (100 \
+             frames) even once; they need 400 KiB | {hint}"
         )]
     );
     let classic = about(|facts| {
@@ -373,7 +375,7 @@ fn a_receive_buffer_holds_one_answer_at_least_and_should_hold_four() {
         facts.buses[0].target.format = Format::Classic;
     });
     assert!(
-        classic[0].contains("to hold all answers (200 frames) 4 times, they need 800 KiB"),
+        classic[0].contains("to hold the answers of all cells (200 frames) 4 times, they need 800 KiB"),
         "{classic:?}"
     );
 }
@@ -384,17 +386,15 @@ fn the_backlog_holds_an_answer_of_every_cell_of_every_bus() {
     assert_eq!(backlog(Some(100)), Vec::<String>::new());
     assert_eq!(
         backlog(Some(99)),
-        [
-            "fault: the kernel's backlog of 99 does not hold the answers of all cells (100 frames): some would be lost \
-          silently | sudo sysctl -w net.core.netdev_max_backlog=200"
-        ]
+        ["fault: the kernel's receive backlog of 99 cannot hold the answers of all cells (100 frames): \
+             some would be lost silently | sudo sysctl -w net.core.netdev_max_backlog=200"]
     );
-    assert!(backlog(None)[0].starts_with("note: the kernel's backlog cannot be seen"));
+    assert!(backlog(None)[0].starts_with("note: the kernel's receive backlog cannot be read"));
     let two = about(|facts| {
         facts.backlog = Some(150);
         facts.buses.push(bus(Some(interface("vcan1", InterfaceKind::Vcan))));
     });
-    assert!(two[0].starts_with("fault: the kernel's backlog of 150"), "{two:?}");
+    assert!(two[0].starts_with("fault: the kernel's receive backlog of 150"), "{two:?}");
 }
 
 #[test]

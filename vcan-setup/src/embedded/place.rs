@@ -81,7 +81,8 @@ impl BusSocket {
                 return Err(BusSocketError::InTheWay(path));
             }
             Ok(_) => {
-                let probe = seqpacket_socket(SocketFlags::NONBLOCK).map_err(failed("ask for"))?;
+                let probe =
+                    seqpacket_socket(SocketFlags::NONBLOCK).map_err(failed("create a socket to probe"))?;
                 // Connecting is refused only if the socket has no listener. A full backlog causes another error.
                 if rustix::net::connect(&probe, &address) != Err(Errno::CONNREFUSED) {
                     return Err(BusSocketError::Served { name: name.to_owned(), path });
@@ -89,12 +90,12 @@ impl BusSocket {
                 rustix::fs::unlinkat(&lock, &file, AtFlags::empty()).map_err(failed("remove"))?;
             }
             Err(Errno::NOENT) => {}
-            Err(errno) => return Err(failed("look at")(errno)),
+            Err(errno) => return Err(failed("query")(errno)),
         }
-        let listener = seqpacket_socket(SocketFlags::NONBLOCK).map_err(failed("make"))?;
-        rustix::net::bind(&listener, &address).map_err(failed("make"))?;
+        let listener = seqpacket_socket(SocketFlags::NONBLOCK).map_err(failed("create"))?;
+        rustix::net::bind(&listener, &address).map_err(failed("create"))?;
         rustix::net::listen(&listener, LISTEN_BACKLOG).map_err(failed("listen on"))?;
-        let stat = rustix::fs::statat(&lock, &file, AtFlags::SYMLINK_NOFOLLOW).map_err(failed("look at"))?;
+        let stat = rustix::fs::statat(&lock, &file, AtFlags::SYMLINK_NOFOLLOW).map_err(failed("query"))?;
         let inode = (stat.st_dev, stat.st_ino);
         Ok(Self { listener, path, directory: directory.to_owned(), file, inode })
     }

@@ -33,7 +33,7 @@ impl ServerThread {
         let failed = |doing| move |source| ServeError::Io { name: name.to_owned(), doing, source };
         let server = Server::bind_in(directory, name)?;
         let path = server.path().to_owned();
-        let (stop, stopped) = UnixStream::pair().map_err(failed("make a handle to stop it"))?;
+        let (stop, stopped) = UnixStream::pair().map_err(failed("create the socket pair that stops it"))?;
         let thread = std::thread::Builder::new()
             .name(format!("bus {name}"))
             .spawn(move || server.run(stopped))

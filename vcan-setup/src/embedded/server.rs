@@ -112,7 +112,7 @@ impl Server {
         let failed =
             |doing| move |errno: Errno| ServeError::Io { name: name.to_owned(), doing, source: errno.into() };
         let place = BusSocket::bind(directory, name)?;
-        let epoll = epoll::create(epoll::CreateFlags::CLOEXEC).map_err(failed("make an epoll"))?;
+        let epoll = epoll::create(epoll::CreateFlags::CLOEXEC).map_err(failed("create an epoll instance"))?;
         epoll::add(&epoll, &place.listener, EventData::new_u64(LISTENER), EventFlags::IN)
             .map_err(failed("listen"))?;
         Ok(Self {
@@ -154,7 +154,7 @@ impl Server {
         let name = self.name.clone();
         let failed = |doing, errno: Errno| ServeError::Io { name: name.clone(), doing, source: errno.into() };
         epoll::add(&self.post.epoll, &stop, EventData::new_u64(STOP), EventFlags::IN)
-            .map_err(|errno| failed("wait for the end", errno))?;
+            .map_err(|errno| failed("watch for the stop request", errno))?;
         let mut events = Vec::with_capacity(256);
         loop {
             events.clear();

@@ -60,7 +60,7 @@ pub enum MessageError {
     #[error("a message of {0} bytes has the wrong length for its frames")]
     Length(usize),
     /// A frame is invalid.
-    #[error("frame {index} of a message: {error}")]
+    #[error("frame {index} of a message is invalid: {error}")]
     Frame {
         /// The index of the frame in the message.
         index: usize,

@@ -5,34 +5,34 @@ use std::path::PathBuf;
 use clap::Args;
 use protocol::bus::{BusError, BusKind, KindChoice, check_name};
 
-/// Join a bus here with those of the same name on other hosts, until SIGINT or SIGTERM
+/// Link a bus of this host to the buses of the same name on other hosts, until SIGINT or SIGTERM
 ///
 /// Carries every frame over Zenoh (TCP or TLS), or counts where and why it was lost. The bus never waits for a link:
-/// frames that it cannot carry are dropped, and counted. The network is not searched: name the other hosts with
-/// --connect, the address of this host with --listen, or both in a configuration file of Zenoh. A lost connection is
-/// made again.
+/// frames that it cannot carry are dropped, and counted. Hosts are not discovered: give the addresses of other hosts
+/// with --connect, the address of this host with --listen, or both in a configuration file of Zenoh. A lost connection
+/// is established again.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vcan-setup link vcan0 --listen tcp/192.168.1.7:7447      on the host of the robot
   vcan-setup link vcan0 --connect tcp/192.168.1.7:7447     on the host of the cells
   vcan-setup link vcan0 --config tls.json5
 
-A program of its own does it, vcan-link, beside vcan-setup or on PATH. To install it, in the project's folder:
+The command runs the program vcan-link, beside vcan-setup or on PATH. To install it, run in the project's folder:
   cargo install --locked --path vcan-setup/link")]
 pub struct LinkOptions {
-    /// The bus
+    /// Name of the bus
     #[arg(value_parser = parse_bus_name)]
     pub bus: String,
-    /// A configuration of Zenoh: certificates, access control, endpoints
+    /// Configuration file of Zenoh, with certificates, access control and endpoints
     #[arg(long, value_name = "FILE.json5")]
     pub config: Option<PathBuf>,
     /// Connect to this host: tcp/HOST:PORT or tls/HOST:PORT; may be repeated for further hosts
     #[arg(long, value_name = "ENDPOINT")]
     pub connect: Vec<String>,
-    /// Wait for other hosts at this address
+    /// Accept connections of other hosts at this address
     #[arg(long, value_name = "ENDPOINT")]
     pub listen: Vec<String>,
-    /// This host's name among the others; by default the machine's name
+    /// Name of this host for the other hosts [default: the name of the machine]
     #[arg(long, value_name = "NAME")]
     pub host: Option<String>,
     /// The requested kind of the bus.

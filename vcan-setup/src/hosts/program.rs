@@ -31,8 +31,8 @@ const VERSION: &str = env!("CARGO_PKG_VERSION");
 pub enum ProgramError {
     /// `vcan-link` was not found.
     #[error(
-        "vcan-link was found neither beside vcan-setup nor on PATH; to install it, in the project's folder: \
-         `cargo install --locked --path vcan-setup/link`"
+        "vcan-link was found neither beside vcan-setup nor on PATH; to install it, run in the project's \
+         folder: `cargo install --locked --path vcan-setup/link`"
     )]
     Missing,
     /// The system cannot run the file that [`PATH_VARIABLE`] names.
@@ -53,8 +53,8 @@ pub enum ProgramError {
     },
     /// `vcan-link` and the `vcan-setup` that runs it have different versions.
     #[error(
-        "vcan-link {VERSION} was run by vcan-setup {0}: both must have the same version; in the project's folder: \
-         `cargo install --locked --path vcan-setup/link`"
+        "vcan-link {VERSION} was run by vcan-setup {0}, but both must have the same version; to install it, \
+         run in the project's folder: `cargo install --locked --path vcan-setup/link`"
     )]
     Version(String),
 }
@@ -148,7 +148,7 @@ mod tests {
     fn another_version_is_refused_with_both() {
         assert!(check_caller_version(None).is_ok() && check_caller_version(Some(VERSION.as_ref())).is_ok());
         let error = check_caller_version(Some("0.0.9".as_ref())).unwrap_err().to_string();
-        assert!(error.starts_with(&format!("vcan-link {VERSION} was run by vcan-setup 0.0.9: ")), "{error}");
+        assert!(error.starts_with(&format!("vcan-link {VERSION} was run by vcan-setup 0.0.9, ")), "{error}");
         assert!(check_caller_version(Some("".as_ref())).is_err());
     }
 }

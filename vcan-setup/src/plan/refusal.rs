@@ -12,7 +12,7 @@ use crate::link::{FD_MTU, HardwareRates, Interface};
 pub enum PlanRefusal {
     /// The interface does not carry CAN.
     #[error(
-        "{name} is {what}, which vcan-setup leaves alone: choose another name, as in `vcan-setup up vcan0`"
+        "{name} is {what}, which vcan-setup does not change: choose another name, as in `vcan-setup up vcan0`"
     )]
     NotCan {
         /// The name of the interface.
@@ -22,7 +22,8 @@ pub enum PlanRefusal {
     },
     /// The named interface is CAN hardware, but the command makes virtual interfaces.
     #[error(
-        "{name} is {what}, which vcan-setup leaves alone: to check its bit rates, add it to a skin and run `vcan-setup up SKIN.toml`; `vcan-setup status {name}` shows it"
+        "{name} is {what}, which vcan-setup does not change: to check its bit rates, add it to a skin and \
+         run `vcan-setup up SKIN.toml`; `vcan-setup status {name}` shows them"
     )]
     Hardware {
         /// The name of the interface.
@@ -32,7 +33,8 @@ pub enum PlanRefusal {
     },
     /// The interface has too small an MTU, and another program has made it.
     #[error(
-        "{name} has MTU {mtu} and CAN FD needs {FD_MTU}; vcan-setup has not made it and leaves it alone: `sudo sh -c '{}'` fixes it",
+        "{name} has MTU {mtu} and CAN FD needs {FD_MTU}; vcan-setup did not make it and does not change it: \
+         `sudo sh -c '{}'` fixes it",
         set_fd_mtu_command("ip", name)
     )]
     Narrow {
@@ -43,7 +45,7 @@ pub enum PlanRefusal {
     },
     /// The interface is down, and another program has made it.
     #[error(
-        "{0} is down; vcan-setup has not made it and leaves it alone: `sudo ip link set {0} up` fixes it"
+        "{0} is down; vcan-setup did not make it and does not change it: `sudo ip link set {0} up` fixes it"
     )]
     Down(String),
     /// The name belongs to an interface that is not an end of the requested pair.
@@ -77,7 +79,8 @@ pub enum PlanRefusal {
     OneName(String),
     /// The interface does not exist. It is hardware, because the skin states a bit rate for it.
     #[error(
-        "there is no interface {name}, and {file} gives it a bitrate, so it is hardware: plug it in and load its driver, or leave out bitrate and it will be a vcan"
+        "there is no interface {name}, and {file} gives it a bitrate, so it is hardware: plug it in and load \
+         its driver, or remove bitrate to get a vcan"
     )]
     Absent {
         /// The name of the interface.
@@ -113,7 +116,8 @@ pub enum PlanRefusal {
     },
     /// The hardware is down.
     #[error(
-        "{name} is {what}, and down: `sudo vcan-setup up {file} --set-bit-rates` sets its bit rates and brings it up"
+        "{name} is {what}, but down: `sudo vcan-setup up {file} --set-bit-rates` sets its bit rates and \
+         brings it up"
     )]
     HardwareDown {
         /// The name of the interface.
@@ -150,7 +154,7 @@ pub enum PlanRefusal {
         file: String,
     },
     /// The interface is to be removed, but another program has made it.
-    #[error("{name} is {what} that vcan-setup has not made, and is left alone{hint}")]
+    #[error("{name} is {what} that vcan-setup did not make, so it stays unchanged{hint}")]
     NotOurs {
         /// The name of the interface.
         name: String,

@@ -68,13 +68,13 @@ fn a_real_bus_is_never_touched_because_it_was_named() {
     ];
     assert_eq!(
         refused(&InterfaceTarget::named("can0"), &present),
-        "can0 is CAN hardware (kvaser_pci), which vcan-setup leaves alone: to check its bit rates, add it to a \
-         skin and run `vcan-setup up SKIN.toml`; `vcan-setup status can0` shows it"
+        "can0 is CAN hardware (kvaser_pci), which vcan-setup does not change: to check its bit rates, add it \
+         to a skin and run `vcan-setup up SKIN.toml`; `vcan-setup status can0` shows them"
     );
     assert_eq!(
         refused(&InterfaceTarget::named("eth0"), &present),
-        "eth0 is a network interface (ether), which vcan-setup leaves alone: choose another name, as in `vcan-setup \
-         up vcan0`"
+        "eth0 is a network interface (ether), which vcan-setup does not change: choose another name, as in \
+         `vcan-setup up vcan0`"
     );
     assert!(
         plan_up(&[InterfaceTarget::named("can0")], &present, true).is_err(),
@@ -87,12 +87,13 @@ fn what_somebody_else_made_is_left_alone_and_the_hint_is_told() {
     let foreign = |mtu, up| Interface { mtu, up, ..interface("vcan0", 2, InterfaceKind::Vcan) };
     assert_eq!(
         refused(&InterfaceTarget::named("vcan0"), &[foreign(16, true)]),
-        "vcan0 has MTU 16 and CAN FD needs 72; vcan-setup has not made it and leaves it alone: `sudo sh -c \
-         'ip link set vcan0 down && ip link set vcan0 mtu 72 up'` fixes it"
+        "vcan0 has MTU 16 and CAN FD needs 72; vcan-setup did not make it and does not change it: `sudo sh \
+         -c 'ip link set vcan0 down && ip link set vcan0 mtu 72 up'` fixes it"
     );
     assert_eq!(
         refused(&InterfaceTarget::named("vcan0"), &[foreign(72, false)]),
-        "vcan0 is down; vcan-setup has not made it and leaves it alone: `sudo ip link set vcan0 up` fixes it"
+        "vcan0 is down; vcan-setup did not make it and does not change it: `sudo ip link set vcan0 up` fixes \
+         it"
     );
 }
 
@@ -109,8 +110,8 @@ fn hardware_of_a_skin_is_compared_and_left_as_it_is() {
     let right = can0(kvaser(Some(1_000_000), Some(5_000_000)), true);
     let plan = plan_up(std::slice::from_ref(&target), std::slice::from_ref(&right), false).unwrap();
     assert_eq!(plan.steps, []);
-    let line = "can0 is CAN hardware (kvaser_pci), at 1000 kbit/s, data 5000 kbit/s, as the skin requires, and is \
-                left as it is";
+    let line = "can0 is CAN hardware (kvaser_pci), runs at 1000 kbit/s, data 5000 kbit/s, as the skin requires, and \
+                stays unchanged";
     assert_eq!(plan.unchanged, [line]);
     assert_eq!(plan_up(std::slice::from_ref(&target), &[right], true).unwrap().steps, [], "nor set again");
 
@@ -139,8 +140,8 @@ fn hardware_of_a_skin_is_compared_and_left_as_it_is() {
     let down = [can0(kvaser(Some(1_000_000), Some(5_000_000)), false)];
     assert_eq!(
         refused(&target, &down),
-        "can0 is CAN hardware (kvaser_pci), and down: `sudo vcan-setup up skin.toml --set-bit-rates` sets its \
-         bit rates and brings it up"
+        "can0 is CAN hardware (kvaser_pci), but down: `sudo vcan-setup up skin.toml --set-bit-rates` sets \
+         its bit rates and brings it up"
     );
 }
 
@@ -219,8 +220,8 @@ fn a_bus_with_a_bit_rate_is_never_made_of_software() {
     let target = in_skin("can0", Format::Classic, Some(500_000), None);
     assert_eq!(
         refused(&target, &[]),
-        "there is no interface can0, and skin.toml gives it a bitrate, so it is hardware: plug it in and load \
-         its driver, or leave out bitrate and it will be a vcan"
+        "there is no interface can0, and skin.toml gives it a bitrate, so it is hardware: plug it in and \
+         load its driver, or remove bitrate to get a vcan"
     );
 }
 
@@ -283,20 +284,20 @@ fn only_what_is_ours_is_removed() {
     assert_eq!(
         plan.unchanged,
         [
-            "vcan1 is a vcan that vcan-setup has not made, and is left alone",
-            "can0 is CAN hardware (kvaser_pci) that vcan-setup has not made, and is left alone",
-            "vcan9 is not there",
+            "vcan1 is a vcan that vcan-setup did not make, so it stays unchanged",
+            "can0 is CAN hardware (kvaser_pci) that vcan-setup did not make, so it stays unchanged",
+            "vcan9 does not exist",
         ]
     );
     let named = |name| plan_down(&[InterfaceTarget::named(name)], &present);
     assert_eq!(
         named("vcan1").unwrap_err().to_string(),
-        "vcan1 is a vcan that vcan-setup has not made, and is left alone: if it is yours, `sudo ip link del \
-         vcan1` removes it"
+        "vcan1 is a vcan that vcan-setup did not make, so it stays unchanged: if it is yours, `sudo ip link \
+         del vcan1` removes it"
     );
     assert_eq!(
         named("can0").unwrap_err().to_string(),
-        "can0 is CAN hardware (kvaser_pci) that vcan-setup has not made, and is left alone"
+        "can0 is CAN hardware (kvaser_pci) that vcan-setup did not make, so it stays unchanged"
     );
     assert_eq!(named("vcan9").unwrap().steps, [], "what is not there is removed already");
 }

@@ -132,11 +132,11 @@ impl BusToLineDropCounts {
     const fn named_counts(&self) -> [(u64, &'static str); 6] {
         [
             (self.queue_full, "line too slow"),
-            (self.line_away, "line away"),
+            (self.line_away, "line unavailable"),
             (self.not_classic, "FD frames for a classic adapter"),
             (self.error_frame, "error frames"),
             (self.refused, "refused by the adapter"),
-            (self.ended, "at the end"),
+            (self.ended, "not sent before the end"),
         ]
     }
 }
@@ -151,9 +151,9 @@ impl LineToBusDropCounts {
     const fn named_counts(&self) -> [(u64, &'static str); 4] {
         [
             (self.queue_full, "bus full"),
-            (self.bus_away, "bus away"),
+            (self.bus_away, "bus unavailable"),
             (self.not_classic, "FD frames for a classic bus"),
-            (self.ended, "at the end"),
+            (self.ended, "not sent before the end"),
         ]
     }
 }
@@ -167,7 +167,7 @@ impl RefusedLineCounts {
 
     fn named_counts(self) -> [(u64, &'static str); 5] {
         [
-            (self.garbage.into(), "garbage"),
+            (self.garbage.into(), "invalid characters"),
             (self.long.into(), "too long"),
             (self.short.into(), "too short"),
             (self.dlc.into(), "wrong DLC"),
@@ -177,7 +177,7 @@ impl RefusedLineCounts {
 }
 
 impl BusToLineCounts {
-    /// Formats losses as `, 3 dropped (2 line too slow, 1 line away)`; empty if there are none.
+    /// Formats losses as `, 3 dropped (line too slow: 2, line unavailable: 1)`; empty if there are none.
     pub(super) fn losses(&self) -> String {
         format_losses("dropped", &self.dropped.named_counts())
             + &format_losses("not received", &[(self.dropped_by_bus, "dropped by the bus")])
@@ -197,8 +197,8 @@ fn format_losses(what: &str, named: &[(u64, &'static str)]) -> String {
     if total == 0 {
         return String::new();
     }
-    let reasons: Vec<_> =
-        named.iter().filter(|(count, _)| *count > 0).map(|(count, name)| format!("{count} {name}")).collect();
+    let occurred = named.iter().filter(|(count, _)| *count > 0);
+    let reasons: Vec<_> = occurred.map(|(count, name)| format!("{name}: {count}")).collect();
     format!(", {total} {what} ({})", reasons.join(", "))
 }
 
@@ -216,7 +216,7 @@ impl fmt::Display for LineAccount {
         let Self { line, opened, lost, reopened, to_line, to_bus, faults } = self;
         write!(f, "{line}: opened {}, lost {}", times_text(*opened), times_text(*lost))?;
         if *reopened > 0 {
-            write!(f, ", opened again after refusals {}", times_text(*reopened))?;
+            write!(f, ", reopened after refusals {}", times_text(*reopened))?;
         }
         write!(
             f,
@@ -227,7 +227,7 @@ impl fmt::Display for LineAccount {
         )?;
         write!(f, "\n  to the bus:  {} received, {} sent{}", to_bus.received, to_bus.sent, to_bus.losses())?;
         if to_bus.bells > 0 {
-            write!(f, ", {} times BEL", to_bus.bells)?;
+            write!(f, ", BEL received {} times", to_bus.bells)?;
         }
         if !faults.is_empty() {
             write!(f, "\n  the adapter reported: {}", describe_faults_since(&FaultCounts::new(), faults))?;
@@ -271,19 +271,21 @@ mod tests {
         };
         assert_eq!(
             account.to_string(),
-            "/dev/ttyACM0: opened 2 times, lost once\n  to the line: 23 received, 1 sent, 22 dropped (1 line too \
-             slow, 2 line away, 3 FD frames for a classic adapter, 4 error frames, 7 refused by the adapter, 5 at the \
-             end), 6 not received (6 \
-             dropped by the bus)\n  to the bus:  11 received, 1 sent, 10 dropped (1 bus full, 2 bus away, 3 FD frames \
-             for a classic bus, 4 at the end), 6 lines refused (1 garbage, 2 too short, 3 wrong identifier), 7 times BEL"
+            "/dev/ttyACM0: opened 2 times, lost once\n  to the line: 23 received, 1 sent, 22 dropped (line too \
+             slow: 1, line unavailable: 2, FD frames for a classic adapter: 3, error frames: 4, refused by the \
+             adapter: 7, not sent before the end: 5), 6 not received (dropped by the bus: 6)\n  to the bus:  11 \
+             received, 1 sent, 10 dropped (bus full: 1, bus unavailable: 2, FD frames for a classic bus: 3, not \
+             sent before the end: 4), 6 lines refused (invalid characters: 1, too short: 2, wrong identifier: \
+             3), BEL received 7 times"
         );
         (account.reopened, account.faults) = (1, FaultCounts::from([("no ACK", 3), ("bus off", 1)]));
         let text = account.to_string();
         assert!(
-            text.starts_with("/dev/ttyACM0: opened 2 times, lost once, opened again after refusals once\n"),
+            text.starts_with("/dev/ttyACM0: opened 2 times, lost once, reopened after refusals once\n"),
             "{text}"
         );
-        assert!(text.ends_with(", 7 times BEL\n  the adapter reported: bus off, no ACK (3 times)"), "{text}");
+        let end = ", BEL received 7 times\n  the adapter reported: bus off, no ACK (3 times)";
+        assert!(text.ends_with(end), "{text}");
         assert_eq!(account.to_line.dropped.total() + account.to_line.sent, account.to_line.received);
         assert_eq!(account.to_bus.dropped.total() + account.to_bus.sent, account.to_bus.received);
     }

@@ -194,9 +194,9 @@ fn line_error(line: String, source: io::Error) -> BridgeError {
     let hint = if says_it {
         ""
     } else if source.kind() == io::ErrorKind::PermissionDenied {
-        "; join the group that may use it (`ls -l` names it, often dialout)"
+        "; join the group that may use the device (`ls -l` shows it, often dialout)"
     } else {
-        "; with --wait it is opened when it is available"
+        "; with --wait, it is opened when it becomes available"
     };
     BridgeError::Line { line, source, hint }
 }

@@ -37,14 +37,18 @@ pub enum LineEvent {
 impl fmt::Display for LineEvent {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::LineUp => f.write_str("open"),
-            Self::LineAway(why) => write!(f, "unavailable ({why}); it is opened when it is available"),
-            Self::BusUp => f.write_str("its bus is back"),
-            Self::BusAway(why) => write!(f, "its bus is unavailable ({why}); it is opened when it is available"),
+            Self::LineUp => f.write_str("the line is open"),
+            Self::LineAway(why) => {
+                write!(f, "the line is unavailable ({why}); it is opened when it becomes available")
+            }
+            Self::BusUp => f.write_str("the bus is available again"),
+            Self::BusAway(why) => {
+                write!(f, "the bus is unavailable ({why}); it is opened when it becomes available")
+            }
             Self::Lost { to_line, to_bus, account } => {
                 let one = |count: u64, what, so_far: String| {
                     let so_far = so_far.trim_start_matches(", ");
-                    (count > 0).then(|| format!("{count} more {what} lost, in total {so_far}"))
+                    (count > 0).then(|| format!("{count} more {what} lost; in total {so_far}"))
                 };
                 let lost = [
                     one(*to_line, "frames to the line", account.to_line.losses()),
@@ -54,15 +58,17 @@ impl fmt::Display for LineEvent {
             }
             Self::SettingRefused(commands) => write!(
                 f,
-                "its adapter refused a command of {commands} (BEL): it may not have these bit rates; give rates that it supports, and \
-                 classic if it has no CAN FD"
+                "the adapter refused a command of {commands} (BEL): it may not support these bit rates; give \
+                 rates that it supports, and classic if it has no CAN FD"
             ),
             Self::Reopened => f.write_str(
-                "its adapter refuses frames (BEL): it is closed, was reset, or its queue is full; it is opened again (a board \
-                 that is reset when its line is opened needs settle=2)",
+                "the adapter refuses frames (BEL): it is closed, was reset, or its queue is full; it is \
+                 opened again (a board that is reset when its line is opened needs settle=2)",
             ),
-            Self::Reported(faults) => write!(f, "its adapter reports {faults}"),
-            Self::NotClosed => f.write_str("its adapter was not closed: it took nothing at the end"),
+            Self::Reported(faults) => write!(f, "the adapter reports {faults}"),
+            Self::NotClosed => {
+                f.write_str("the adapter was not closed, because it accepted no data at the end")
+            }
         }
     }
 }

@@ -70,7 +70,7 @@ impl PortOpener {
             }
             LineAddress::Tcp { .. } => {
                 let host = self.hosts.get(self.next % self.hosts.len().max(1));
-                let host = *host.ok_or_else(|| io::Error::other("its host has no address"))?;
+                let host = *host.ok_or_else(|| io::Error::other("the host name has no address"))?;
                 self.next += 1;
                 let family = if host.is_ipv4() { AddressFamily::INET } else { AddressFamily::INET6 };
                 let port = connect(family, |fd| rustix::net::connect(fd, &host))?;
@@ -111,7 +111,7 @@ impl LinePort {
     /// Reads available bytes. Returns their number, which is 0 if none are available yet.
     pub(super) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         match rustix::io::read(&self.fd, buffer) {
-            Ok(0) => Err(io::Error::new(io::ErrorKind::UnexpectedEof, "it was closed")),
+            Ok(0) => Err(io::Error::new(io::ErrorKind::UnexpectedEof, "the other end closed it")),
             Ok(count) => Ok(count),
             Err(Errno::AGAIN | Errno::INTR) => Ok(0),
             Err(errno) => Err(errno.into()),
@@ -171,14 +171,14 @@ fn open_tty(path: &Path, baud: Option<u32>) -> io::Result<OwnedFd> {
     match flock(&fd, FlockOperation::NonBlockingLockExclusive) {
         Ok(()) => {}
         Err(Errno::WOULDBLOCK) => {
-            let used = "another program uses it; stop that one first";
+            let used = "another program uses it; stop that program first";
             return Err(io::Error::new(io::ErrorKind::ResourceBusy, used));
         }
         Err(errno) => return Err(errno.into()),
     }
     let mut settings = match termios::tcgetattr(&fd) {
         Ok(settings) => settings,
-        Err(Errno::NOTTY) => return other("it is no terminal".to_owned()),
+        Err(Errno::NOTTY) => return other("it is not a terminal".to_owned()),
         Err(errno) => return Err(errno.into()),
     };
     settings.make_raw();

@@ -116,7 +116,7 @@ const ALLOWED_RATES: &str = "slcan has the bit rates 10k, 20k, 50k, 83.3k, 100k,
                      for data 500k and whole Mbit/s up to 8M";
 
 /// A description of the allowed values of [`LineOptions::settle`], for an error.
-pub const ALLOWED_SETTLE_TIMES: &str = "seconds from 0 to 60, such as 2 or 0.5";
+pub const ALLOWED_SETTLE_TIMES: &str = "use 0 to 60 seconds, such as 2 or 0.5";
 
 /// Parses a value of [`LineOptions::settle`], given in s.
 #[must_use]
@@ -206,7 +206,7 @@ impl LineOptions {
             "cell" => {
                 let (first, last) = value.split_once('-').unwrap_or((value, value));
                 let cell = |text: &str| text.parse::<CellId>().ok();
-                let expected = "node ids are 1 to 254: cell=12, or cell=1-8";
+                let expected = "use node ids from 1 to 254, as in cell=12 or cell=1-8";
                 let (first, last) = cell(first).zip(cell(last)).ok_or_else(|| wrong(&expected))?;
                 if first > last {
                     return Err(wrong(&expected));
@@ -216,7 +216,8 @@ impl LineOptions {
                     .for_each(|cell| self.add_cell(cell));
                 if self.filters.len() > Filter::MAX_COUNT {
                     return Err(wrong(&format!(
-                        "these cells need {} filters, but a line can have {}: name fewer cells, or none",
+                        "these cells need {} filters, but a line can have at most {}: name fewer cells, or \
+                         none",
                         self.filters.len(),
                         Filter::MAX_COUNT
                     )));
@@ -224,7 +225,8 @@ impl LineOptions {
             }
             "filter" => {
                 let filter = parse_filter(value).ok_or_else(|| {
-                    wrong(&"identifier and mask as candump has them: filter=100:700, or 8 digits each for 29 bits")
+                    let forms = "filter=100:700, or 8 digits each for 29 bits";
+                    wrong(&format!("use an identifier and a mask, as in candump: {forms}"))
                 })?;
                 self.filters.push(filter);
             }
@@ -236,7 +238,7 @@ impl LineOptions {
             }
             "baud" => {
                 let baud = value.parse().ok().filter(|baud| *baud > 0);
-                self.baud = Some(baud.ok_or_else(|| wrong(&"bits in a second: baud=115200"))?);
+                self.baud = Some(baud.ok_or_else(|| wrong(&"use a speed in bit/s, as in baud=115200"))?);
             }
             "settle" => {
                 self.settle = parse_settle_time(value).ok_or_else(|| wrong(&ALLOWED_SETTLE_TIMES))?;
@@ -404,19 +406,24 @@ mod tests {
     #[test]
     fn what_no_line_has_is_refused_with_what_it_has() {
         for (text, expected) in [
-            ("/dev/x,cell=0", "/dev/x: \"cell=0\": node ids are 1 to 254: cell=12, or cell=1-8"),
-            ("/dev/x,cell=8-1", "/dev/x: \"cell=8-1\": node ids are 1 to 254: cell=12, or cell=1-8"),
+            ("/dev/x,cell=0", "/dev/x: \"cell=0\": use node ids from 1 to 254, as in cell=12 or cell=1-8"),
+            (
+                "/dev/x,cell=8-1",
+                "/dev/x: \"cell=8-1\": use node ids from 1 to 254, as in cell=12 or cell=1-8",
+            ),
             (
                 "/dev/x,cell=1-254",
-                "/dev/x: \"cell=1-254\": these cells need 769 filters, but a line can have 512: name fewer cells, or none",
+                "/dev/x: \"cell=1-254\": these cells need 769 filters, but a line can have at most 512: name \
+                 fewer cells, or none",
             ),
             (
                 "/dev/x,filter=100",
-                "/dev/x: \"filter=100\": identifier and mask as candump has them: filter=100:700, or 8 digits each for 29 bits",
+                "/dev/x: \"filter=100\": use an identifier and a mask, as in candump: filter=100:700, or 8 \
+                 digits each for 29 bits",
             ),
-            ("/dev/x,settle=-1", "/dev/x: \"settle=-1\": seconds from 0 to 60, such as 2 or 0.5"),
-            ("/dev/x,settle=NaN", "/dev/x: \"settle=NaN\": seconds from 0 to 60, such as 2 or 0.5"),
-            ("/dev/x,baud=fast", "/dev/x: \"baud=fast\": bits in a second: baud=115200"),
+            ("/dev/x,settle=-1", "/dev/x: \"settle=-1\": use 0 to 60 seconds, such as 2 or 0.5"),
+            ("/dev/x,settle=NaN", "/dev/x: \"settle=NaN\": use 0 to 60 seconds, such as 2 or 0.5"),
+            ("/dev/x,baud=fast", "/dev/x: \"baud=fast\": use a speed in bit/s, as in baud=115200"),
             (
                 "/dev/x,rates=2M",
                 "/dev/x: \"rates=2M\": nominal bit rate 2000000 bit/s: CAN allows 10000 to 1000000 (10k to 1M)",

@@ -187,7 +187,7 @@ fn explain_torques_of_parts(
         let Some(moment) = moment else {
             if skin.cells_on_bus(index).next().is_some() {
                 explanation.missing.push(format!(
-                    "{name}: the capture has no joints of this epoch; the total does not include this bus"
+                    "{name}: the capture contains no joints message of this epoch; the total does not include this bus"
                 ));
             }
             continue;
@@ -316,20 +316,20 @@ impl JointTorqueSum {
 #[expect(clippy::cast_precision_loss, reason = "for display")]
 fn too_late_text(nanos: u64) -> String {
     let ms = nanos as f64 / 1e6;
-    format!("it arrived {ms:.3} ms after its joints and after four newer joints, so it is not used")
+    format!("it arrived {ms:.3} ms after its joints message and after four newer ones, so it is not used")
 }
 
 /// Returns the likely reason why a cell in contact sent nothing.
 fn silence_reason(halted: bool, state: Option<State>) -> &'static str {
     let has = |bit| state.is_some_and(|state| state.has(bit));
     if halted || has(State::HALTED) {
-        "it was halted"
+        "the cell was halted"
     } else if has(State::CLAIMING_NODE_ID) {
-        "it had just started and was claiming its node id"
+        "the cell had just started and was claiming its node id"
     } else if state.is_some_and(|state| !state.has(State::CONFIGURED)) {
-        "it had no configuration"
+        "the cell had no configuration"
     } else {
-        "it was lost, or the cell was not on the bus"
+        "the frame was lost, or the cell was not on the bus"
     }
 }
 
@@ -350,21 +350,22 @@ fn usable_contact(
         Some(hash) if hash != target => {
             if answered || touched {
                 missing.push(format!(
-                    "{bus} {node}: its configuration is {hash:04X}, but the skin's is {target:04X}: its force \
-                     and torque cannot be computed from this skin"
+                    "{bus} {node}: its configuration hash is {hash:04X}, but the skin's is {target:04X}, so its \
+                     force and torque cannot be computed from this skin"
                 ));
             }
             return None;
         }
         None if answered || touched => missing.push(format!(
-            "{bus} {node}: it did not report its configuration, which is assumed to be the skin's, {target:04X}"
+            "{bus} {node}: it did not report its configuration hash, which is assumed to be that of the skin, \
+             {target:04X}"
         )),
         Some(_) | None => {}
     }
     if answered && said.contact_state.is_none() {
         let why = match said.test_mode {
             Some(false) => "it uses its own sensors, and sent no sensors page in this epoch",
-            Some(true) | None => "no stimulus, start or sensors page of this cell came before",
+            Some(true) | None => "the capture has no earlier start, stimulus or sensors page of this cell",
         };
         missing.push(format!("{bus} {node}: its contact state is not in the capture: {why}"));
     }

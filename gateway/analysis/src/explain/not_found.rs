@@ -7,7 +7,9 @@ use thiserror::Error;
 #[non_exhaustive]
 pub enum JointsNotFound {
     /// The capture has none of the skin's buses.
-    #[error("the skin has none of the capture's buses ({capture}); it has {skin}")]
+    #[error(
+        "the skin has none of the capture's buses ({capture}), only {skin}: name the skin of this capture"
+    )]
     Buses {
         /// Names of the buses in the capture.
         capture: String,
@@ -15,7 +17,9 @@ pub enum JointsNotFound {
         skin: String,
     },
     /// The capture has no joints on the skin's buses.
-    #[error("the capture has no joints messages on {buses}, and cells answer only those")]
+    #[error(
+        "the capture contains no joints message on {buses}, and cells send torques only as answers to these"
+    )]
     Joints {
         /// Names of the skin's buses that are in the capture.
         buses: String,
@@ -31,7 +35,7 @@ pub enum JointsNotFound {
         chain: usize,
     },
     /// The requested epoch does not occur, occurs less often than requested, or occurs only before the requested time.
-    #[error("the capture has no joints message {requested}; it has {runs}")]
+    #[error("the capture contains no joints message {requested}; it contains {runs}")]
     Epoch {
         /// Description of the requested joints.
         requested: String,
@@ -44,6 +48,7 @@ pub enum JointsNotFound {
 #[must_use]
 pub fn other_robot_text(bus: &str, came: usize, chain: usize) -> String {
     format!(
-        "{bus} carries {came} joints, but the skin's chain on it has {chain}: this skin is for another robot; name the right one"
+        "joints messages on {bus} have {came} positions, but the skin's chain on this bus has {chain} joints: name \
+         the skin of this robot"
     )
 }

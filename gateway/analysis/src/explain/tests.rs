@@ -141,8 +141,8 @@ fn another_configuration_is_named_and_nothing_computed() {
     let skin = skin();
     let said = [heartbeat(0x1234), press(StimulusStart::Next, 1.0), joints(7), torque(7, [-1075, 3195])];
     let explanation = explained(&skin, &said, first(7)).unwrap();
-    let expected = "vcan0 12: its configuration is 1234, but the skin's is 266D: its force and torque cannot \
-                    be computed from this skin";
+    let expected = "vcan0 12: its configuration hash is 1234, but the skin's is 266D, so its force and torque \
+                    cannot be computed from this skin";
     assert_eq!(explanation.missing, [expected]);
     assert!(explanation.cells[0].force.is_none());
     assert_eq!((explanation.total[0].open, explanation.total[0].word_steps), (1, -1075));
@@ -150,7 +150,8 @@ fn another_configuration_is_named_and_nothing_computed() {
     let said = [press(StimulusStart::Next, 1.0), joints(7), torque(7, [-1075, 3195]), heartbeat(0x1234)];
     assert_eq!(explained(&skin, &said, first(7)).unwrap().missing, [expected]);
     let without = explained(&skin, &said[..3], first(7)).unwrap();
-    let expected = "vcan0 12: it did not report its configuration, which is assumed to be the skin's, 266D";
+    let expected =
+        "vcan0 12: it did not report its configuration hash, which is assumed to be that of the skin, 266D";
     assert_eq!(without.missing, [expected]);
     assert!(without.cells[0].force.is_some());
 }
@@ -193,8 +194,8 @@ fn joints_are_found_by_epoch_time_and_occurrence() {
     assert_eq!(at(RequestedJoints { occurrence: 2, ..first(7) }), Ok(264));
     assert_eq!(at(RequestedJoints { from_ns: 100_000_000, ..first(7) }), Ok(264));
     let error = at(RequestedJoints { occurrence: 2, ..first(21) }).unwrap_err().to_string();
-    let expected = "the capture has no joints message of epoch 21 (occurrence 2); it has 277 in a row, from epoch 0 at \
-                    0.000 s to epoch 20 at 0.276 s";
+    let expected = "the capture contains no joints message of epoch 21 (occurrence 2); it contains 277 in a row, \
+                    from epoch 0 at 0.000 s to epoch 20 at 0.276 s";
     assert_eq!(error, expected);
 }
 
@@ -203,15 +204,19 @@ fn what_is_not_there_is_named_with_what_is() {
     let skin = skin();
     let said = [joints(1), joints(2), joints(9)];
     let error = explained(&skin, &said, first(5)).unwrap_err().to_string();
-    let expected = "the capture has no joints message of epoch 5; it has 2 in a row, from epoch 1 at 0.000 s to epoch 2 at \
-                    0.001 s; one of epoch 9 at 0.002 s";
+    let expected = "the capture contains no joints message of epoch 5; it contains 2 in a row, from epoch 1 at \
+                    0.000 s to epoch 2 at 0.001 s; one of epoch 9 at 0.002 s";
     assert_eq!(error, expected);
     let error = explained(&skin, &[heartbeat(0)], first(5)).unwrap_err().to_string();
-    assert_eq!(error, "the capture has no joints messages on vcan0, and cells answer only those");
+    let expected =
+        "the capture contains no joints message on vcan0, and cells send torques only as answers to these";
+    assert_eq!(error, expected);
     let mut watch = JointsWatcher::new(&skin, first(5));
     watch.receive(0, "can7", None);
     let error = watch.into_joints().unwrap_err().to_string();
-    assert_eq!(error, "the skin has none of the capture's buses (can7); it has vcan0");
+    let expected =
+        "the skin has none of the capture's buses (can7), only vcan0: name the skin of this capture";
+    assert_eq!(error, expected);
     // Memory is bounded for any input.
     let said: Vec<_> = (0..200).map(|epoch: u8| joints(epoch.wrapping_mul(3))).collect();
     let error =
@@ -239,8 +244,8 @@ fn a_torque_after_four_more_joints_is_named_and_not_used() {
     let in_time = explained(&skin, &said(3), first(7)).unwrap();
     assert_eq!((in_time.cells[0].answered_after_ns, in_time.missing), (Some(4_000_000), Vec::new()));
     let late = explained(&skin, &said(4), first(7)).unwrap();
-    let expected = "vcan0 12: no torque of this epoch arrived in time: it arrived 5.000 ms after its joints \
-                    and after four newer joints, so it is not used; the sum of received words does not include it";
+    let expected = "vcan0 12: no torque of this epoch arrived in time: it arrived 5.000 ms after its joints message \
+                    and after four newer ones, so it is not used; the sum of received words does not include it";
     assert_eq!((late.cells[0].answered_after_ns, late.missing), (None, vec![expected.to_owned()]));
 }
 

@@ -170,7 +170,7 @@ impl NeededBuses {
         self.limits_where(|buses| Some(key(buses)) == most)
     }
 
-    /// Returns the number of buses and the limits that require it, as a short text such as `3 nodes`. Bandwidth and
+    /// Returns the number of buses and the limits that require it, as a short text such as `3 (nodes)`. Bandwidth and
     /// deadline are both called time.
     #[must_use]
     pub fn short_text(&self) -> String {
@@ -182,8 +182,8 @@ impl NeededBuses {
         words.dedup();
         match self.required_buses() {
             Some(1) => "1".to_owned(),
-            Some(buses) => format!("{buses} {}", words.join(", ")),
-            None => format!("none {}", words.join(", ")),
+            Some(buses) => format!("{buses} ({})", words.join(", ")),
+            None => format!("none ({})", words.join(", ")),
         }
     }
 }

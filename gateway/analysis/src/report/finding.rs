@@ -17,7 +17,7 @@ pub struct Finding {
     pub ours: Quantity,
     /// The requirement as text: `at most 0.005 Nm`.
     pub bar: Option<String>,
-    /// Text shown if there is no requirement: the reference of the rating, such as `below the paper's`, or the
+    /// Text shown if there is no requirement: the reference of the rating, such as `below the paper's value`, or the
     /// reason why it was not rated.
     pub against: Option<String>,
     /// Where the requirement comes from: an option, the skin's file, a default.
@@ -34,7 +34,7 @@ impl Finding {
     #[must_use]
     pub fn less_is_better(what: impl Into<String>, paper: f64, ours: impl Into<Quantity>) -> Self {
         let finding =
-            Self::new_unrated(what, ours).with_paper_value(paper).with_reference("below the paper's");
+            Self::new_unrated(what, ours).with_paper_value(paper).with_reference("below the paper's value");
         Self { verdict: FindingVerdict::less_is_better(paper, finding.ours.value), ..finding }
     }
 
@@ -43,7 +43,7 @@ impl Finding {
     #[must_use]
     pub fn more_is_better(what: impl Into<String>, paper: f64, ours: impl Into<Quantity>) -> Self {
         let finding =
-            Self::new_unrated(what, ours).with_paper_value(paper).with_reference("above the paper's");
+            Self::new_unrated(what, ours).with_paper_value(paper).with_reference("above the paper's value");
         Self { verdict: FindingVerdict::less_is_better(finding.ours.value, paper), ..finding }
     }
 

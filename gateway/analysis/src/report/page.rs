@@ -107,7 +107,7 @@ fn write_findings(out: &mut String, findings: &[Finding]) {
     let shown = [true, paper, true, limit, paper || limit];
     out.push_str("<div class=\"scroll\"><table class=\"findings\">\n<thead>");
     let head = [
-        ("figure", ""),
+        ("quantity", ""),
         ("paper", NUMBER_CLASS_ATTRIBUTE),
         ("here", NUMBER_CLASS_ATTRIBUTE),
         ("limit", ""),
@@ -118,10 +118,10 @@ fn write_findings(out: &mut String, findings: &[Finding]) {
     for finding in findings {
         let (class, verdict) = match (finding.verdict, &finding.bar) {
             (FindingVerdict::Better, None) => ("better", "✓ better"),
-            (FindingVerdict::Better, Some(_)) => ("better", "✓ holds"),
+            (FindingVerdict::Better, Some(_)) => ("better", "✓ met"),
             (FindingVerdict::Same, _) => ("same", "= the same"),
             (FindingVerdict::Worse, None) => ("worse", "✗ worse"),
-            (FindingVerdict::Worse, Some(_)) => ("worse", "✗ does not hold"),
+            (FindingVerdict::Worse, Some(_)) => ("worse", "✗ not met"),
             (FindingVerdict::Stated, _) => ("stated", ""),
         };
         let origin = finding.origin.as_ref().map(|origin| format!(" ({origin})")).unwrap_or_default();
@@ -295,11 +295,13 @@ mod tests {
         }
         let rows: Vec<_> = all("tr").into_iter().map(text).collect();
         assert!(
-            rows.contains(&"errorlook <here>5.4\u{a0}mNm63\u{a0}µNmbelow the paper's✓ better".to_owned()),
+            rows.contains(
+                &"errorlook <here>5.4\u{a0}mNm63\u{a0}µNmbelow the paper's value✓ better".to_owned()
+            ),
             "{rows:?}"
         );
         assert!(
-            rows.contains(&"slope250 ± 500\u{a0}mNmbelow 1 Nm (--limit)✗ does not hold".to_owned()),
+            rows.contains(&"slope250 ± 500\u{a0}mNmbelow 1 Nm (--limit)✗ not met".to_owned()),
             "{rows:?}"
         );
         let right: Vec<_> =

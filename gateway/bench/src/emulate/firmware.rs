@@ -18,7 +18,7 @@ const MAX_FILE_BYTES: u64 = 64 << 20;
 #[non_exhaustive]
 pub enum FirmwareError {
     /// The file cannot be read.
-    #[error("--firmware {path}: {source}; docs/how-to/firmware.md explains how to build one")]
+    #[error("--firmware {path}: {source}; docs/how-to/firmware.md explains how to build the firmware")]
     Read {
         /// Path of the file.
         path: PathBuf,
@@ -27,20 +27,26 @@ pub enum FirmwareError {
     },
     /// The file is not for this kind of microcontroller.
     #[error(
-        "--firmware {path}: not an ELF file of a 32-bit ARM microcontroller; docs/how-to/firmware.md explains how to build one"
+        "--firmware {path}: the file is not an ELF file for a 32-bit Arm microcontroller; docs/how-to/firmware.md \
+         explains how to build the firmware"
     )]
     NotArm {
         /// Path of the file.
         path: PathBuf,
     },
     /// The file has no section for the factory's record.
-    #[error("--firmware {path}: it has no section {section}, so it is not the firmware of a cell", section = factory::SECTION)]
+    #[error(
+        "--firmware {path}: the file has no section {section}, so it is not the firmware of a cell",
+        section = factory::SECTION
+    )]
     NoCell {
         /// Path of the file.
         path: PathBuf,
     },
     /// The file is for another board.
-    #[error("--firmware {path}: it is for a board without an emulator; build it with `--features microbit`")]
+    #[error(
+        "--firmware {path}: no emulator exists for its board; build the firmware with `--features microbit`"
+    )]
     OtherBoard {
         /// Path of the file.
         path: PathBuf,
@@ -110,10 +116,10 @@ mod tests {
     fn what_is_no_firmware_is_named() {
         let missing = Firmware::read(Path::new("/nowhere/cell")).unwrap_err().to_string();
         assert!(missing.starts_with("--firmware /nowhere/cell: No such file"), "{missing}");
-        assert!(error(b"nothing").contains("not an ELF file of a 32-bit ARM microcontroller"));
+        assert!(error(b"nothing").contains("not an ELF file for a 32-bit Arm microcontroller"));
         let own = std::fs::read(std::env::current_exe().unwrap()).unwrap();
         assert!(
-            error(&own).contains("not an ELF file of a 32-bit ARM microcontroller"),
+            error(&own).contains("not an ELF file for a 32-bit Arm microcontroller"),
             "this test's own program"
         );
     }

@@ -52,17 +52,18 @@ pub enum EmulateError {
     #[error(transparent)]
     Firmware(#[from] FirmwareError),
     /// The emulator is not installed.
-    #[error("{QEMU} is not in PATH, and --emulate needs it: apt-get install {QEMU}")]
+    #[error("--emulate needs {QEMU}, which is not in PATH: run `apt-get install {QEMU}`")]
     NoEmulator,
     /// Files cannot be written.
-    #[error("cannot write the files of emulated cells: {0}; set TMPDIR to a folder with room")]
+    #[error("cannot write the files of emulated cells: {0}; set TMPDIR to a directory with free space")]
     Files(#[source] std::io::Error),
     /// The path contains characters that the emulator's command line cannot carry, or is too long.
-    #[error("--flash {0}: paths of emulated cells must be UTF-8 without spaces, and at most 240 bytes")]
+    #[error("--flash {0}: with --emulate, the path must be UTF-8 without spaces and at most 240 bytes long")]
     Path(PathBuf),
     /// Cells of another run keep their flash in this directory.
     #[error(
-        "--flash {0}: emulated cells of another run are using it: stop that run first, or choose another directory"
+        "--flash {0}: emulated cells of another run are using this directory: stop that run first, or choose another \
+         directory"
     )]
     FlashInUse(PathBuf),
     /// A line or a process does not start.
@@ -97,7 +98,7 @@ pub enum EmulateError {
         how: String,
     },
     /// A signal interrupted the start.
-    #[error("interrupted while starting")]
+    #[error("the run was interrupted while it was starting")]
     Interrupted,
 }
 
@@ -329,7 +330,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let held = lock_directory(folder.path()).unwrap();
         let error = lock_directory(folder.path()).unwrap_err();
-        assert!(error.to_string().contains("emulated cells of another run are using it"), "{error}");
+        assert!(error.to_string().contains("emulated cells of another run are using this"), "{error}");
         assert_eq!(error.exit_code(), 2);
         drop(held);
         lock_directory(folder.path()).unwrap();

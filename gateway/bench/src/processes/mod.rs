@@ -45,7 +45,7 @@ const TERM_TIMEOUT: Duration = Duration::from_secs(2);
 pub enum LaunchError {
     /// The program does not exist.
     #[error(
-        "{name} is not at {path}: build it with `cargo build --release`, or name its path in {}",
+        "the program {name} is not at {path}: build it with `cargo build --release`, or set {} to its path",
         path_variable(name)
     )]
     Missing {
@@ -55,7 +55,7 @@ pub enum LaunchError {
         path: PathBuf,
     },
     /// The program exists and does not start.
-    #[error("{path} does not start: {source}")]
+    #[error("cannot start {path}: {source}")]
     Start {
         /// Path of the program.
         path: PathBuf,
@@ -69,9 +69,7 @@ pub enum LaunchError {
     #[error("cannot create a pipe for the messages of cells: {0}")]
     Pipe(std::io::Error),
     /// The limit of open files is below the number that buses and cells need.
-    #[error(
-        "at most {limit} files may be open at once, and this bench needs {needed}: run `ulimit -n {needed}` first"
-    )]
+    #[error("this bench needs {needed} open files, but the limit is {limit}: run `ulimit -n {needed}` first")]
     Files {
         /// The limit.
         limit: u64,
@@ -79,7 +77,7 @@ pub enum LaunchError {
         needed: u64,
     },
     /// An embedded bus is not served.
-    #[error("{path} does not serve {bus}; see its own message above")]
+    #[error("{path} does not serve the bus {bus}; see its own message above")]
     Serve {
         /// Path of the serving program.
         path: PathBuf,
@@ -490,7 +488,7 @@ mod tests {
     #[test]
     fn a_missing_program_is_named_with_the_hint() {
         let error = program_path("no-such-program").unwrap_err().to_string();
-        assert!(error.starts_with("no-such-program is not at /"), "{error}");
-        assert!(error.ends_with("or name its path in SKINBUS_NO_SUCH_PROGRAM"), "{error}");
+        assert!(error.starts_with("the program no-such-program is not at /"), "{error}");
+        assert!(error.ends_with("or set SKINBUS_NO_SUCH_PROGRAM to its path"), "{error}");
     }
 }

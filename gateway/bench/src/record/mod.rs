@@ -92,7 +92,7 @@ pub enum OutputError {
         source: io::Error,
     },
     /// The name of the recording does not end in `.mcap`.
-    #[error("--record {}: a recording's name ends in .mcap", .0.display())]
+    #[error("--record {}: the name of a recording must end in .mcap", .0.display())]
     Name(PathBuf),
 }
 
@@ -210,7 +210,7 @@ impl Recorder {
         self.stop.now.store(true, Ordering::Release);
         let mut recording = self.thread.join().unwrap_or_else(|_| {
             let errors =
-                vec!["the recorder panicked: what it had written is recovered by the next run".to_owned()];
+                vec!["the recorder panicked: the next run recovers the part that was written".to_owned()];
             RecordingAccount { errors, ..RecordingAccount::default() }
         });
         recording.lost_queue = unrecorded.frames;

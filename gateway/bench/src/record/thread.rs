@@ -285,7 +285,7 @@ impl RecorderThread {
         let mut parts = vec![Diagnosis {
             level: if self.ticks_skipped > 0 { DiagnosisLevel::Warn } else { DiagnosisLevel::Ok },
             name: "gateway: control loop".to_owned(),
-            message: if self.ticks_skipped > 0 { "ticks were skipped" } else { "in time" }.to_owned(),
+            message: if self.ticks_skipped > 0 { "ticks were skipped" } else { "ticks on time" }.to_owned(),
             values: vec![
                 ("ticks", mem::take(&mut self.ticks).to_string()),
                 ("skipped", mem::take(&mut self.ticks_skipped).to_string()),
@@ -300,7 +300,7 @@ impl RecorderThread {
         parts.push(Diagnosis {
             level: if all_well { DiagnosisLevel::Ok } else { DiagnosisLevel::Error },
             name: "gateway: recorder".to_owned(),
-            message: if all_well { "everything is recorded" } else { "something is missing" }.to_owned(),
+            message: if all_well { "all data was recorded" } else { "some data was not recorded" }.to_owned(),
             values: vec![
                 ("bytes", series.bytes().to_string()),
                 ("frames_not_written", lost.frames.to_string()),
@@ -482,7 +482,7 @@ fn diagnose_bus(bus_feed: &BusFeed, name: &str, seen: &BusRecord) -> Diagnosis {
     }
     let (level, message) = match (works, silent, seen.dropped) {
         (false, _, _) => (DiagnosisLevel::Error, "the bus does not work"),
-        (true, 0, 0) => (DiagnosisLevel::Ok, "all cells are there"),
+        (true, 0, 0) => (DiagnosisLevel::Ok, "all cells are present"),
         (true, 0, _) => (DiagnosisLevel::Warn, "frames were dropped"),
         (true, _, _) => (DiagnosisLevel::Warn, "cells are silent"),
     };

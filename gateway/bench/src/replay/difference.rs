@@ -149,8 +149,8 @@ fn sum_text(cell: CellId, epoch: Epoch, own: &OwnContribution, units: BusUnits) 
     let children: Vec<_> = own.children.iter().map(ToString::to_string).collect();
     let less = match children.as_slice() {
         [] => "no children".to_owned(),
-        [one] => format!("less its child {one}"),
-        several => format!("less its children {}", several.join(", ")),
+        [one] => format!("minus its child {one}"),
+        several => format!("minus its children {}", several.join(", ")),
     };
     let word = |(joint, step): (usize, &Option<i32>)| match (step, units.torque_unit(joint)) {
         (None, _) => " saturated".to_owned(),
@@ -173,7 +173,7 @@ fn message_text(message: Message, units: BusUnits) -> String {
     text.split_once(' ').map_or(String::new(), |(_, text)| text.trim_start().to_owned())
 }
 
-/// Formats the differences between torques: `joint 1: 2 steps more (0.0005 Nm), joint 3: ...`.
+/// Formats the differences between torques: `joint 1: 2 steps higher (0.0005 Nm), joint 3: ...`.
 struct StepDifferences {
     recorded: [Option<i32>; MAX_JOINTS],
     now: [Option<i32>; MAX_JOINTS],
@@ -188,10 +188,10 @@ impl Display for StepDifferences {
             let joint = index + 1;
             let steps = now.unwrap_or(0) - recorded.unwrap_or(0);
             if now.is_none() != recorded.is_none() {
-                let when = if now.is_none() { "now" } else { "then" };
+                let when = if now.is_none() { "now" } else { "in the recording" };
                 write!(f, "{comma}joint {joint}: saturated {when}")?;
             } else if steps != 0 {
-                let (count, way) = (steps.unsigned_abs(), if steps > 0 { "more" } else { "less" });
+                let (count, way) = (steps.unsigned_abs(), if steps > 0 { "higher" } else { "lower" });
                 let steps = if count == 1 { "step" } else { "steps" };
                 let (value, unit) =
                     (f64::from(count) * self.format.step_size(), self.units.torque_unit(index));
@@ -227,7 +227,7 @@ mod tests {
             "the first difference: cell 12 on vcan0, joints 37 (epoch 7, 2.384 s into the recording)
   recorded  torque 12 epoch 7: -0.2625 0.7800 0.0000 0.0000 0.0000 0.0000 Nm
   now       torque 12 epoch 7: -0.2622 0.7795 0.0000 0.0000 0.0000 0.0000 Nm
-  joint 1: 1 step more (0.0002 Nm), joint 2: 2 steps less (0.0005 Nm)";
+  joint 1: 1 step higher (0.0002 Nm), joint 2: 2 steps lower (0.0005 Nm)";
         assert_eq!(difference.text, expected);
     }
 

@@ -15,7 +15,7 @@ use trace::capture::CaptureError;
 pub enum CellMismatch {
     /// All cells differ.
     #[error(
-        "the recording is of another skin: the configurations of all {count} cells differ, {cells}; {}",
+        "the recording was made with another skin: the configurations of all {count} cells differ: {cells}; {}",
         hint(*.spawned)
     )]
     Skin {
@@ -27,7 +27,7 @@ pub enum CellMismatch {
         spawned: bool,
     },
     /// Some cells differ.
-    #[error("cells have another configuration than in the recording: {cells}; {}", hint(*.spawned))]
+    #[error("these cells have a different configuration in the recording: {cells}; {}", hint(*.spawned))]
     Cells {
         /// Names of the cells, with their configurations.
         cells: String,
@@ -35,12 +35,15 @@ pub enum CellMismatch {
         spawned: bool,
     },
     /// Some cells are absent.
-    #[error("cells of the recording are absent: {0}; start them with cell-node, or all with --spawn")]
+    #[error(
+        "these cells of the recording are not on the bus: {0}; start them with cell-node, or start all cells with \
+         --spawn"
+    )]
     Absent(String),
     /// The recording has no heartbeat.
     #[error(
-        "nothing can be compared: the recording has no heartbeat of a cell, so its skin is unknown; record \
-         for half a second at least"
+        "the replies cannot be compared: the recording has no heartbeat of a cell, so its skin is unknown; record \
+         for at least half a second"
     )]
     Unknown,
 }
@@ -65,11 +68,15 @@ pub enum ReplayError {
     Kinds(#[from] KindsError),
     /// Standard input cannot be read twice.
     #[error(
-        "a replay reads its capture twice, which standard input does not allow: write it to a file, and name that file"
+        "a replay reads its capture twice, which is impossible with standard input: save the capture to a file, and \
+         name that file"
     )]
     StandardInput,
     /// A pipe cannot be read twice.
-    #[error("{} is not a regular file, but a replay reads its capture twice: copy it to a file, and name that file", .0.display())]
+    #[error(
+        "{} is not a regular file, but a replay reads its capture twice: save the capture to a file, and name it",
+        .0.display()
+    )]
     Pipe(PathBuf),
     /// The capture does not open.
     #[error(transparent)]
@@ -84,13 +91,13 @@ pub enum ReplayError {
     #[error("{0} has frames of more than {MAX_BUSES} buses, which is the maximum for a replay")]
     Buses(String),
     /// The capture has nothing to send.
-    #[error("{0} contains no frame")]
+    #[error("{0} contains no frames")]
     Empty(String),
     /// The bus does not exist, so no cell on it can answer.
     #[error("{0}; or start fresh cells on an embedded bus with --spawn")]
     BusAbsent(BusError),
     /// The requested part has nothing to send.
-    #[error("--from and --to leave nothing to send: {name} ends at {ends_s:.3} s")]
+    #[error("--from and --to select no frames to send: {name} ends at {ends_s:.3} s")]
     NothingLeft {
         /// Display name of the capture.
         name: String,
@@ -114,18 +121,20 @@ pub enum ReplayError {
     MapTwice(String),
     /// Two buses of the capture are mapped to one.
     #[error(
-        "two buses of the capture are mapped to one, so replies cannot be told apart: map each to its own bus, or leave out --expect, \
-         --lockstep and --only inputs"
+        "two buses of the capture are mapped to the same bus, so their replies cannot be distinguished: map each to \
+         its own bus, or omit --expect, --lockstep and --only inputs"
     )]
     Merged,
     /// The skin of the cells to start is unknown.
     #[error(
-        "--spawn: {0} has no skin attached, unlike recordings of `skinbus run --record`: name the skin with --skin SKIN.toml"
+        "--spawn: {0} contains no skin, unlike recordings of `skinbus run --record`: name the skin with --skin \
+         SKIN.toml"
     )]
     NoSkin(String),
     /// The skin does not have a bus of the capture.
     #[error(
-        "--spawn: the capture is sent to {bus}, but the skin {skin} has {buses}: map it to one of these with --map"
+        "--spawn: the capture is sent to {bus}, but the skin {skin} has only {buses}: map the capture's bus to one of \
+         these with --map"
     )]
     NotOfSkin {
         /// Name of the bus.
@@ -136,7 +145,7 @@ pub enum ReplayError {
         buses: String,
     },
     /// Other cells are on a bus on which cells were to be started.
-    #[error("cells are on {bus} already: {cells}; leave out --spawn to use them, or stop them")]
+    #[error("these cells are already on {bus}: {cells}; omit --spawn to use them, or stop them")]
     CellsPresent {
         /// Name of the bus.
         bus: String,
@@ -144,7 +153,10 @@ pub enum ReplayError {
         cells: String,
     },
     /// A process of cells ended too early.
-    #[error("the process of {cells} ended while starting ({status}){}", reason_suffix(.said.as_deref()))]
+    #[error(
+        "the process of {cells} ended while it was starting ({status}){}",
+        reason_suffix(.said.as_deref())
+    )]
     Ended {
         /// The cells of the process.
         cells: String,
@@ -157,18 +169,18 @@ pub enum ReplayError {
     #[error("another gateway is on {0}: stop it, or send the capture to another bus with --map")]
     OtherGateway(String),
     /// No cell is on the buses.
-    #[error("no cell answers on {0}: start them with cell-node, or with --spawn")]
+    #[error("no cell answers on {0}: start the cells with cell-node, or with --spawn")]
     NoCell(String),
     /// The cells are not in the state of the recording.
     #[error(transparent)]
     Mismatch(#[from] CellMismatch),
     /// Cells do not confirm that they are in test mode.
-    #[error("cells do not enter test mode: {0}")]
+    #[error("these cells did not enter test mode: {0}")]
     NoTestMode(String),
     /// Cells measure and ignore stimuli.
     #[error(
-        "cells use their own sensors and ignore stimuli, unlike in the recording: {0}; --test-mode makes them obey during the \
-         replay"
+        "these cells use their own sensors and ignore stimuli, unlike in the recording: {0}; use --test-mode, which \
+         puts them into test mode during the replay"
     )]
     Measuring(String),
 }

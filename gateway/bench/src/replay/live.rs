@@ -97,7 +97,9 @@ impl PlayerBackend for LiveBackend {
         if let Err(SendError { cause: error @ BusError::Down(_), .. }) = &sent {
             if self.down.insert(index) {
                 self.shared_state.comparator().mark_down(index);
-                self.notify(format!("{error}; frames due until it works again are lost and counted"));
+                self.notify(format!(
+                    "{error}; frames that are due before the bus works again are lost and counted"
+                ));
             }
             // At a timed pace, waiting for answers would delay the next frames.
             let ReplayOptions { pace, lockstep, .. } = self.shared_state.checks.options;

@@ -139,9 +139,9 @@ impl ReplaySession {
             let is_over = timeout.has_stalled(usize::MAX - count);
             for (bus_link, cells) in without.iter().filter(|(_, cells)| is_over && !cells.is_empty()) {
                 let (name, cells) = (bus_link.bus.name(), format_cells(cells, ""));
-                session.progress.print_note(&format!(
-                    "cells on {name} are unreachable, without a route to the gateway: {cells}"
-                ));
+                session
+                    .progress
+                    .print_note(&format!("these cells on {name} have no route to the gateway: {cells}"));
             }
             Ok(is_over)
         })

@@ -207,7 +207,7 @@ fn survey_capture(
     if let Some((frame, nanos)) = backwards.filter(|(_, nanos)| *nanos > trace::order::REORDER_WINDOW_NS) {
         let back = Duration::from_nanos(nanos).as_secs_f64();
         note(format!(
-            "times run backwards, first at frame {frame} by {back:.3} s: a frame older than one already \
+            "time stamps run backwards, first at frame {frame} by {back:.3} s: a frame that is older than one already \
              sent is sent at once"
         ));
     }
@@ -231,7 +231,8 @@ fn warn_of_duplicates(checks: &CellChecks, heard: &[BTreeSet<CellId>], progress:
         let both: Vec<_> = heard.iter().copied().filter(|cell| bus.cells.contains_key(cell)).collect();
         if !both.is_empty() {
             progress.print_note(&format!(
-                "cells on {name} will receive copies of their own frames from the capture: {}; --only inputs leaves these frames out",
+                "these cells on {name} will receive copies of their own frames from the capture: {}; use --only inputs \
+                 to omit these frames",
                 format_cells(&both, "")
             ));
         }

@@ -109,13 +109,13 @@ impl UncomparedReplies {
             ("no counters show whether the cell received the joints", self.uncounted),
             ("the joints were not recorded", self.joints_unrecorded),
             ("the joints came before the replayed part", self.joints_earlier),
-            ("the configure came before the replayed part", self.requested_earlier),
-            ("the cell measured", self.measured),
-            ("unrequested sensors were sent at other joints", self.sensed_otherwise),
+            ("the configure command came before the replayed part", self.requested_earlier),
+            ("the cell used its own sensors", self.measured),
+            ("unrequested sensor pages were sent after other joints", self.sensed_otherwise),
             ("the cell missed its slot", self.slot_skipped),
             ("a cell was changing its parent", self.parent_changing),
             ("a cell had not reported its parent", self.tree_unknown),
-            ("a sum lacked one of its children's", self.sums_not_taken),
+            ("a sum did not contain the sum of a child", self.sums_not_taken),
         ])
     }
 }
@@ -140,13 +140,13 @@ impl Summary {
                 ("different", different),
                 ("missing", missing),
                 ("extra", extra),
-                ("not asked for", not_requested),
+                ("not requested", not_requested),
             ]);
             let counts: Vec<_> = counts.iter().map(|(what, count)| format!("{count} {what}")).collect();
             if !counts.is_empty() {
                 let by = expect.tally.torque_words.max;
                 let by = if by > expect.tolerance.into() {
-                    format!(", torque words by up to {by} steps (--tolerance {})", expect.tolerance)
+                    format!(", torque words differ by up to {by} steps (--tolerance {})", expect.tolerance)
                 } else {
                     String::new()
                 };
@@ -154,12 +154,13 @@ impl Summary {
             }
             if expect.tally.lacks_known_trees() {
                 wrong.push(
-                    "no sum could be compared: cells have not reported their parents, then or now".to_owned(),
+                    "no sum could be compared: cells did not report their parents in the recording or in this replay"
+                        .to_owned(),
                 );
             }
             if expect.joints_skipped > 0 && self.lockstep.is_none() {
                 wrong.push(format!(
-                    "cells skipped joints {} because they were too late: --lockstep waits for the cells",
+                    "cells skipped joints {} because they received them too late: use --lockstep to wait for the cells",
                     count_noun(expect.joints_skipped, "time", "times")
                 ));
             }
@@ -184,15 +185,13 @@ impl Summary {
     /// equal.
     #[must_use]
     pub fn result_line(&self) -> (bool, String) {
-        let until = if self.interrupted { " until it was interrupted" } else { "" };
+        let until = if self.interrupted { " until the replay was interrupted" } else { "" };
         let sent = format!("{} sent", count_noun(self.sent, "frame", "frames"));
         match (self.failure_reason(true), &self.expect) {
-            (Some(why), _) => (false, format!("look at: {why}")),
-            (None, None) => {
-                (false, format!("all sent{until}: {sent}; no reply was compared; use --expect for that"))
-            }
+            (Some(why), _) => (false, format!("problems: {why}")),
+            (None, None) => (false, format!("all sent{until}: {sent}; use --expect to compare the replies")),
             (None, Some(expect)) if expect.tally.equal == 0 => {
-                (false, format!("look at: no reply was compared, {sent}"))
+                (false, format!("problems: no reply was compared, {sent}"))
             }
             (None, Some(expect)) => {
                 let equal = format!("{} as recorded", count_noun(expect.tally.equal, "reply", "replies"));
@@ -212,11 +211,7 @@ impl Summary {
                     ),
                     (
                         expect.unchecked_cells,
-                        count_noun(
-                            expect.unchecked_cells,
-                            "configuration not known",
-                            "configurations not known",
-                        ),
+                        count_noun(expect.unchecked_cells, "configuration unknown", "configurations unknown"),
                     ),
                 ];
                 let unchecked = unchecked.into_iter().filter(|(count, _)| *count > 0).map(|(_, text)| text);
@@ -276,7 +271,7 @@ mod tests {
         };
         assert_eq!(line(|_, _| {}), (true, "all well: 100 frames sent, 40 replies as recorded".to_owned()));
         let interrupted = line(|it, _| it.interrupted = true);
-        assert!(interrupted.0 && interrupted.1.starts_with("all well until it was interrupted: "));
+        assert!(interrupted.0 && interrupted.1.starts_with("all well until the replay was interrupted: "));
         for (change, begin) in [
             (
                 (|_, expect| expect.tally.lacking.ended = 1) as fn(&mut Summary, &mut ReplyComparison),
@@ -284,13 +279,13 @@ mod tests {
             ),
             (|_, expect| expect.recording_dropped = 2, "no difference: "),
             (|_, expect| expect.unchecked_cells = 1, "no difference: "),
-            (|_, expect| expect.tally.equal = 0, "look at: no reply was compared"),
+            (|_, expect| expect.tally.equal = 0, "problems: no reply was compared"),
             (
                 |_, expect| expect.tally.different = 3,
-                "look at: replies differ from the recorded ones: 3 different",
+                "problems: replies differ from the recorded ones: 3 different",
             ),
-            (|it, _| it.refused = 1, "look at: 1 frame was refused"),
-            (|it, _| it.failure = Some("no bus".to_owned()), "look at: no bus"),
+            (|it, _| it.refused = 1, "problems: 1 frame was refused"),
+            (|it, _| it.failure = Some("no bus".to_owned()), "problems: no bus"),
         ] {
             let (is_well, text) = line(change);
             assert!(!is_well && text.starts_with(begin), "{text}");
@@ -298,7 +293,7 @@ mod tests {
         let sent = Summary { expect: None, ..well() }.result_line();
         assert_eq!(
             sent,
-            (false, "all sent: 100 frames sent; no reply was compared; use --expect for that".to_owned())
+            (false, "all sent: 100 frames sent; use --expect to compare the replies".to_owned())
         );
     }
 

@@ -130,7 +130,7 @@ impl ReplaySession {
         for (bus_link, (name, _)) in bus_links.filter(|_| hears && played.failure.is_none()) {
             if let Err(why) = live.request_counters(bus_link) {
                 self.progress
-                    .print_note(&format!("{name}: its cells were not asked for a final report: {why}"));
+                    .print_note(&format!("{name}: cannot request a final report from the cells: {why}"));
             }
         }
         self.shared_state.comparator().finish(!played.was_stopped && played.failure.is_none());

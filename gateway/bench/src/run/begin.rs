@@ -168,16 +168,16 @@ impl Bench<'_> {
         }
         let measuring = self.selected_cell_names(|cell| cell.measures);
         for (what, who) in [
-            ("do not answer; the run goes on without them", silent),
-            ("have no parameters; the run goes on without them", unconfigured),
+            ("do not answer, so the run continues without them", silent),
+            ("have no parameters, so the run continues without them", unconfigured),
             (
-                "measure, so the scenario does not press them (`skinbus frame configure --cell N --write mode 1` puts \
-                 one into test mode)",
+                "use their own sensors, so the scenario does not press them (`skinbus frame configure --cell N --write \
+                 mode 1` puts one into test mode)",
                 measuring,
             ),
         ] {
             if !who.is_empty() && !self.options.quiet {
-                eprint_line(&format!("cells that {what}: {who}"));
+                eprint_line(&format!("these cells {what}: {who}"));
             }
         }
         Ok(())

@@ -37,7 +37,7 @@ impl Bench<'_> {
             // At the end of the run the other side may end first.
             if !self.signalled.load(Ordering::Relaxed) {
                 progress.print_error(
-                    "--view: the process that served the page has ended; the run goes on without a page",
+                    "--view: the process that served the page has ended; the run continues without the page",
                 );
             }
             return;

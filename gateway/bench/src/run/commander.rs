@@ -55,9 +55,9 @@ impl SwitchedBuses {
     /// the last change.
     pub(super) fn check_switch(&self, down: bool, bus: usize) -> Result<(), CommandError> {
         match (down, self.0.get(&bus)) {
-            (true, Some(BusSwitchState::Down)) => Err(CommandError::Already("up")),
+            (true, Some(BusSwitchState::Down)) => Err(CommandError::AlreadyDown),
             (false, Some(BusSwitchState::Up { .. })) => Err(CommandError::ComesUp),
-            (false, None) => Err(CommandError::Already("down")),
+            (false, None) => Err(CommandError::NotTakenDown),
             (true, Some(BusSwitchState::Up { .. }) | None) | (false, Some(BusSwitchState::Down)) => Ok(()),
         }
     }
@@ -93,19 +93,21 @@ pub(super) enum CommandError {
     NoBus,
     #[error("the skin has no such cell")]
     NoCell,
-    #[error("this run did not start its process")]
+    #[error("this run did not start the process of the cell")]
     NoProcess,
-    #[error("its process is {}", match .0 { Phase::Running => "running", Phase::Stopped => "stopped", Phase::Ended => "ended: restart starts it again" })]
+    #[error("the process {}", phase_text(*.0))]
     Phase(Phase),
     #[error("the skin has no wire between them")]
     NoWire,
-    #[error("cells on this bus answer with torques, not sums, so their links carry nothing")]
+    #[error("the cells of this bus send torques, not sums, so they do not use links")]
     NoLinks,
-    #[error("no command has brought it {0}")]
-    Already(&'static str),
-    #[error("it was brought up, but does not work yet")]
+    #[error("it is already down")]
+    AlreadyDown,
+    #[error("no command has taken it down")]
+    NotTakenDown,
+    #[error("it was already brought up, but does not work yet")]
     ComesUp,
-    #[error("another program serves it: stop that program")]
+    #[error("another program serves this bus: stop that program")]
     NotServed,
     #[error("it is not a virtual interface: only vcan, vxcan and embedded buses can be taken down here")]
     NotVirtual,
@@ -115,6 +117,14 @@ pub(super) enum CommandError {
     Interface { name: String, state: &'static str, source: io::Error },
     #[error(transparent)]
     Launch(#[from] LaunchError),
+}
+
+const fn phase_text(phase: Phase) -> &'static str {
+    match phase {
+        Phase::Running => "is running",
+        Phase::Stopped => "is stopped",
+        Phase::Ended => "has ended: restart it",
+    }
 }
 
 impl RemoteControl {
@@ -148,10 +158,10 @@ mod tests {
     #[test]
     fn a_bus_that_was_taken_up_is_expected_until_it_has_worked() {
         let mut buses = SwitchedBuses::default();
-        assert!(matches!(buses.check_switch(false, 0), Err(CommandError::Already("down"))));
+        assert!(matches!(buses.check_switch(false, 0), Err(CommandError::NotTakenDown)));
         buses.check_switch(true, 0).unwrap();
         buses.note_bus_switched(true, 0, 100);
-        assert!(matches!(buses.check_switch(true, 0), Err(CommandError::Already("up"))));
+        assert!(matches!(buses.check_switch(true, 0), Err(CommandError::AlreadyDown)));
         buses.forget_working_buses(|_| Some(105));
         assert!(buses.is_down(0) && buses.is_loss_expected(0), "what works there is of before");
         // The bus was taken down and up at once, so that its receiver has not noticed the change.

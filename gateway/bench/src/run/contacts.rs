@@ -35,8 +35,8 @@ impl Bench<'_> {
         let unclear = self.selected_cell_names(|cell| cell.unclear);
         if !unclear.is_empty() && !self.options.quiet {
             eprint_line(&format!(
-                "the contact of these cells is unknown, so their torques are not compared: {unclear}; they received \
-                 stimuli before this run (`skinbus frame configure --cell N --write mode 1` clears a cell)"
+                "it is unknown whether these cells are in contact, so their torques are not compared: {unclear}; they \
+                 received stimuli before this run (`skinbus frame configure --cell N --write mode 1` resets a cell)"
             ));
         }
         Ok(())

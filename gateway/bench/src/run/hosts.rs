@@ -128,10 +128,10 @@ impl KnownHosts {
             if before.is_there != newest.is_there {
                 let how = if newest.is_there {
                     known.outages.end_outage(now);
-                    if is_first || known.outages.count == 0 { "is linked" } else { "is reached again" }
+                    if is_first || known.outages.count == 0 { "is connected" } else { "is reachable again" }
                 } else {
                     known.outages.begin_outage(now);
-                    "is gone, or not reached"
+                    "is gone or unreachable"
                 };
                 let of_it = format_cells(&cells, "");
                 let of_it = if cells.is_empty() { String::new() } else { format!(" (cells {of_it})") };
@@ -203,7 +203,7 @@ mod tests {
     fn what_was_lost_before_the_run_is_not_the_runs() {
         let mut of = Fixture::new();
         let (notes, in_doubt, _) = of.take(&[("b", true, 1, 50, 60)]);
-        assert_eq!((notes, in_doubt), (vec!["host 'b' of vcan0 is linked (cells 7, 9)".to_owned()], 0));
+        assert_eq!((notes, in_doubt), (vec!["host 'b' of vcan0 is connected (cells 7, 9)".to_owned()], 0));
         assert_eq!(of.0.lost_frames(), 0);
         assert_eq!(of.take(&[("b", true, 1, 53, 60)]), (vec![], 0, 0), "their own counts show it");
         assert_eq!(of.take(&[("b", true, 1, 53, 64)]), (vec![], 2, 2), "stimuli may be among them");
@@ -218,7 +218,7 @@ mod tests {
         let mut of = Fixture::new();
         of.take(&[("b", true, 1, 0, 0), ("c", true, 1, 0, 0)]);
         let (notes, in_doubt, reached) = of.take(&[("b", false, 1, 0, 0), ("c", true, 1, 0, 0)]);
-        assert_eq!(notes, ["host 'b' of vcan0 is gone, or not reached (cells 7, 9)"]);
+        assert_eq!(notes, ["host 'b' of vcan0 is gone or unreachable (cells 7, 9)"]);
         assert_eq!((in_doubt, reached), (2, 0));
         assert!(
             of.0.is_host_unreachable(CellId::new(7).unwrap())
@@ -226,7 +226,7 @@ mod tests {
         );
         let (notes, in_doubt, reached) = of.take(&[("b", true, 2, 0, 0), ("c", true, 1, 0, 0)]);
         assert!(!of.0.is_host_unreachable(CellId::new(7).unwrap()));
-        assert_eq!(notes, ["host 'b' of vcan0 is reached again (cells 7, 9)"]);
+        assert_eq!(notes, ["host 'b' of vcan0 is reachable again (cells 7, 9)"]);
         assert_eq!((in_doubt, reached), (2, 2));
         assert_eq!(
             of.take(&[("b", true, 3, 0, 0), ("c", true, 1, 0, 0)]).1,

@@ -256,9 +256,10 @@ impl Network {
         if let Some(oldest) = newly_unreachable.iter().map(|(_, since)| now.elapsed_since(*since)).max() {
             self.reported.extend(newly_unreachable.iter().copied());
             let cells: Vec<_> = newly_unreachable.into_iter().map(|(cell, _)| cell).collect();
-            let is = if cells.len() == 1 { "is" } else { "are" };
+            let (has, their) =
+                if cells.len() == 1 { ("has", "its torque") } else { ("have", "their torques") };
             look.notes.push(format!(
-                "{} on {} {is} unreachable: no route to a root, and in no sum for {:.1} s",
+                "{} on {} {has} had no route to a root for {:.1} s, so no sum contains {their}",
                 check::cell_list(&cells),
                 self.name,
                 oldest.seconds()
@@ -423,7 +424,7 @@ mod tests {
         assert_eq!(look(&mut network, &link_down), Vec::<String>::new());
         assert_eq!(
             look(&mut network, &link_down),
-            ["cells 2, 3 on vcan0 are unreachable: no route to a root, and in no sum for 0.4 s"]
+            ["cells 2, 3 on vcan0 have had no route to a root for 0.4 s, so no sum contains their torques"]
         );
         assert_eq!(look(&mut network, &link_down), Vec::<String>::new());
         assert_eq!(network.unreachable_nodes().collect::<Vec<_>>(), [2, 3]);

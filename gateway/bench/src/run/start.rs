@@ -51,7 +51,7 @@ const SEND_TIMEOUT: Duration = Duration::from_millis(10);
 const MAX_GATHER_TIME: Duration = Duration::from_millis(10);
 /// Remark on a receive buffer that is smaller than the requested size.
 const SMALL_BUFFER_REMARK: &str =
-    ", all that net.core.rmem_max allows: a burst of frames may be lost (and is counted)";
+    ", the maximum that net.core.rmem_max allows: frames of a burst may be lost (and are counted)";
 
 /// Claims files and opens buses; [`Bench::bring_up_cells`] starts the cells.
 pub(super) fn start(options: &RunOptions) -> Result<Bench<'_>, RunError> {

@@ -72,7 +72,7 @@ impl StatusLine<'_> {
     }
 
     fn text_with_details(&self, detail: DetailLevels) -> String {
-        let late = (detail.late > 0).then(|| format!("ticks late 99 % {:.0} µs", self.late_us));
+        let late = (detail.late > 0).then(|| format!("tick lateness p99 {:.0} µs", self.late_us));
         let mode = (detail.mode > 0).then(|| format!("{:11}", self.mode));
         let parts = [
             Some(self.time_text(detail.time)),
@@ -160,8 +160,8 @@ mod tests {
 
     #[test]
     fn a_line_without_a_width_has_everything() {
-        let all = "  3.2 of 12.0 s    4 of 253 in contact, 0 stale, 0 dead  ticks late 99 % 45 µs  compare      torque  \
-                   0.00 -12.35  1.00  0.50 -0.25  0.00 Nm";
+        let all = "  3.2 of 12.0 s    4 of 253 in contact, 0 stale, 0 dead  tick lateness p99 45 µs  compare      \
+                   torque  0.00 -12.35  1.00  0.50 -0.25  0.00 Nm";
         assert_eq!(line(6).text(None), all);
         assert_eq!(line(6).text(Some(1_000)), all);
     }

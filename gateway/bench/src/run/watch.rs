@@ -207,7 +207,7 @@ impl Bench<'_> {
                 let hint = format!("`skinbus frame resume --bus {bus} --bus-kind {kind}` resumes it");
                 progress.print_note(&format!("the robot is halted: {why}; {hint}"));
             }
-            (true, None) => progress.print_note("the robot goes on"),
+            (true, None) => progress.print_note("the robot continues"),
             (true, Some(_)) | (false, None) => {}
         }
         for line in self.recorder.iter().flat_map(Recorder::messages) {
@@ -305,7 +305,7 @@ impl Bench<'_> {
             for cell in cells.iter().filter_map(|&cell| options.skin.cells.get(cell)) {
                 let done = self.processes.apply_action(cell.bus, cell.node.get(), *action)?;
                 let bus = self.bus_name(cell.bus);
-                let failed = if done { "" } else { " (this run did not start it)" };
+                let failed = if done { "" } else { ": this run did not start its process" };
                 progress.print_note(&format!("scenario: {action:?} cell {} on {bus}{failed}", cell.node));
             }
         }
@@ -381,7 +381,7 @@ impl Bench<'_> {
                 BusEvent::Lost(why) if self.has_lost_all_buses() => return Err(RunError::Lost(why)),
                 BusEvent::Lost(why) => {
                     progress.print_note(&format!(
-                        "{why}; the other buses continue, and this one is reopened when it is back"
+                        "{why}; the other buses continue, and this bus is reopened when it works again"
                     ));
                 }
                 BusEvent::Refused(why) => {

@@ -53,7 +53,7 @@ impl Verdict {
         buses().for_each(|bus| add_irregular_frames(&mut look_at, bus));
         let ended_well = matches!(summary.outcome, Outcome::Done | Outcome::Interrupted);
         if look_at.is_empty() && !ended_well {
-            look_at.push(format!("the run ended as {}", summary.outcome));
+            look_at.push(format!("the outcome of the run is \"{}\"", summary.outcome));
         }
         Self { well: look_at.is_empty(), look_at }
     }
@@ -79,11 +79,14 @@ impl Summary {
         }
         let contributions = of(|bus| bus.sums.map_or(0, |sums| sums.contributions.in_time));
         if contributions > 0 {
-            parts.push(format!("{} due in sums in time", count_noun(contributions, "cell", "cells")));
+            parts.push(format!(
+                "{} in time",
+                count_noun(contributions, "contribution to sums", "contributions to sums")
+            ));
         }
         let accuracy = &self.accuracy;
         let error = accuracy.single.mean().or_else(|| accuracy.sums.mean());
-        parts.extend(error.map(|mean| format!("error {mean:.1e} Nm")));
+        parts.extend(error.map(|mean| format!("mean error {mean:.1e} Nm")));
         parts.join(", ")
     }
 }
@@ -138,7 +141,7 @@ fn add_ending_findings(look_at: &mut Vec<String>, summary: &Summary) {
     if let Some(why) = &summary.halted {
         let at = summary.halts.last().map_or_else(String::new, |halt| format!(" at {:.3} s", halt.at_s));
         look_at.push(format!(
-            "the robot was halted{at} and not resumed: {why}; before_halt of --summary FILE has the ticks before it"
+            "the robot was halted{at} and not resumed: {why}; before_halt in --summary FILE lists the ticks before it"
         ));
     }
     look_at.extend(summary.no_controller.clone());
@@ -150,7 +153,7 @@ fn add_absence_findings(look_at: &mut Vec<String>, summary: &Summary) {
     for bus in summary.buses.iter().filter(|bus| bus.outages.times > 0) {
         let end = if bus.outages.at_end { ", also at the end" } else { "" };
         look_at.push(format!(
-            "{} was lost {} for {:.1} s in all{end}: its cells' torques decayed to zero",
+            "{} was lost {} for {:.1} s in total{end}: the torques of its cells decayed to zero",
             bus.name,
             occurrence_count_text(bus.outages.times),
             bus.outages.lost_s
@@ -158,7 +161,7 @@ fn add_absence_findings(look_at: &mut Vec<String>, summary: &Summary) {
     }
     for bus in summary.buses.iter().filter(|bus| !bus.silent_cells.is_empty()) {
         look_at.push(format!(
-            "{}: stopped sending, or never sent; check that each runs and is wired",
+            "{}: stopped sending, or never sent; check that each cell is running and wired",
             cell_names(&bus.silent_cells, &bus.name)
         ));
     }
@@ -167,18 +170,19 @@ fn add_absence_findings(look_at: &mut Vec<String>, summary: &Summary) {
     if summary.failure.is_none() {
         let unknown = cells_where(summary, |cell| !is_known(cell));
         look_at
-            .extend(unknown.into_iter().map(|cells| format!("{cells}: the run has no figures of this bus")));
+            .extend(unknown.into_iter().map(|cells| format!("{cells}: the run has no results of this bus")));
     }
     for host in summary.buses.iter().flat_map(|bus| &bus.hosts) {
         let lost = host.lost_from + host.lost_to;
-        let gone = (host.gone > 0)
-            .then(|| format!("gone {} for {:.1} s in all", occurrence_count_text(host.gone), host.gone_s));
-        let end = (!host.at_end).then(|| "not reached at the end".to_owned());
+        let gone = (host.gone > 0).then(|| {
+            format!("unreachable {} for {:.1} s in total", occurrence_count_text(host.gone), host.gone_s)
+        });
+        let end = (!host.at_end).then(|| "unreachable at the end".to_owned());
         let lost = (lost > 0).then(|| format!("{} lost", count_noun(lost, "frame", "frames")));
         let parts: Vec<_> = [gone, end, lost].into_iter().flatten().collect();
         if !parts.is_empty() {
             look_at.push(format!(
-                "host {}: {}; vcan-setup status shows its link",
+                "host {}: {}; `vcan-setup status` shows its link",
                 host.name,
                 parts.join(", ")
             ));
@@ -191,21 +195,21 @@ fn add_unexplained_losses(look_at: &mut Vec<String>, bus: &BusSummary) {
     let (name, replies, up) = (&bus.name, &bus.replies, &bus.uplink);
     if replies.unknown > 0 {
         look_at.push(format!(
-            "{} missing for no known reason (unknown) on {name}: cells[].missing of --summary FILE lists the cells",
+            "{} missing on {name} for no known reason (unknown): cells[].missing in --summary FILE lists the cells",
             count_noun(replies.unknown, "reply", "replies")
         ));
     }
     if up.unknown > 0 {
         look_at.push(format!(
-            "{} sent by cells and not received, for no known reason (unknown), on {name}: check its wiring and load",
+            "{} of cells on {name} lost for no known reason (unknown): check the wiring and the load of the bus",
             count_noun(up.unknown, "packet", "packets")
         ));
     }
     if let Some(parts) = bus.sums.map(|sums| sums.contributions).filter(|parts| parts.missing > 0) {
         look_at.push(format!(
-            "{} of {} due in sums were missing on {name}: no route to a root, lost sums, or a busy machine",
+            "{} of {} were missing on {name}: a cell had no route to a root, sums were lost, or the machine was busy",
             parts.missing,
-            count_noun(parts.due, "cell", "cells")
+            count_noun(parts.due, "contribution to sums", "contributions to sums")
         ));
     }
 }
@@ -215,14 +219,14 @@ fn add_network_findings(look_at: &mut Vec<String>, bus: &BusSummary) {
     let Some(network) = &bus.network else { return };
     if !network.unreachable.is_empty() {
         look_at.push(format!(
-            "{}: no route to a root at the end, so no sum contains them; check their wires",
+            "{}: no route to a root at the end, so no sum contains their torques; check their wires",
             cell_names(&network.unreachable, &bus.name)
         ));
     } else if network.tree_ready_s.is_none() {
         look_at.push(format!("the tree on {} was not complete when the run began", bus.name));
     }
     for difference in &network.differences {
-        look_at.push(format!("{} is not as the skin describes it: {difference}", bus.name));
+        look_at.push(format!("{} differs from the skin: {difference}", bus.name));
     }
 }
 
@@ -232,30 +236,34 @@ fn add_torque_findings(look_at: &mut Vec<String>, summary: &Summary) {
     let is_off = |cell: &CellSummary| cell.error.mean().is_some_and(|mean| is_above(mean, MAX_CELL_ERROR_NM));
     for cells in cells_where(summary, is_off) {
         look_at.push(format!(
-            "{cells}: mean error above {MAX_CELL_ERROR_NM:.1e} Nm, which rounding does not explain; check pose and parameters"
+            "{cells}: mean error above {MAX_CELL_ERROR_NM:.1e} Nm, more than rounding explains; check the parameters"
         ));
     }
-    let of_all =
-        [("single cells", &accuracy.single, MAX_CELL_ERROR_NM), ("sums", &accuracy.sums, MAX_SUM_ERROR_NM)];
+    let of_all = [
+        ("the cells' torques", &accuracy.single, MAX_CELL_ERROR_NM),
+        ("the sums", &accuracy.sums, MAX_SUM_ERROR_NM),
+    ];
     for (what, errors, limit) in of_all {
         if let Some(mean) = errors.mean().filter(|mean| is_above(*mean, limit)) {
             look_at.push(format!(
-                "mean error of {what} {mean:.1e} Nm: rounding explains at most {limit:.1e} Nm"
+                "the mean error of {what} is {mean:.1e} Nm, but rounding explains at most {limit:.1e} Nm"
             ));
         }
     }
     let saturated: u64 = summary.buses.iter().filter_map(|bus| bus.events.get(SATURATED_EVENT_NAME)).sum();
     if saturated > 0 {
         look_at.push(format!(
-            "{} saturated: larger than the torque format can carry, and not compared",
+            "{} saturated: too large for the torque format, and therefore not compared",
             count_noun(saturated, "torque", "torques")
         ));
     } else if accuracy.saturated > 0 {
-        look_at
-            .push(format!("{} saturated, and not compared", count_noun(accuracy.saturated, "word", "words")));
+        look_at.push(format!(
+            "{} saturated, and therefore not compared",
+            count_noun(accuracy.saturated, "torque word", "torque words")
+        ));
     }
     for cells in cells_where(summary, |cell| !cell.stuck.is_empty()) {
-        look_at.push(format!("{cells}: stuck, sent constant words while the expected words changed"));
+        look_at.push(format!("{cells}: stuck, sent constant values while the expected values changed"));
     }
     for bus in &summary.buses {
         let parts = bus.sums.map(|sums| sums.contributions);
@@ -263,8 +271,8 @@ fn add_torque_findings(look_at: &mut Vec<String>, summary: &Summary) {
         let RepliesSummary { unexpected, .. } = bus.replies;
         if unexpected + in_sums > 0 {
             look_at.push(format!(
-                "{} that were not touched, or were halted, on {}: not compared",
-                count_noun(unexpected + in_sums, "torque of cells", "torques of cells"),
+                "{} on {} not compared, because the cells were not touched or were halted",
+                count_noun(unexpected + in_sums, "torque", "torques"),
                 bus.name
             ));
         }
@@ -274,7 +282,9 @@ fn add_torque_findings(look_at: &mut Vec<String>, summary: &Summary) {
 /// Adds findings on restarts of cells, and on halts that have ended.
 fn add_restart_findings(look_at: &mut Vec<String>, summary: &Summary) {
     for cells in cells_where(summary, |cell| cell.restarts > 0) {
-        look_at.push(format!("{cells}: restarted; it is unknown whether replies due at that time were sent"));
+        look_at.push(format!(
+            "{cells}: restarted; it is unknown whether replies that were due at that time were sent"
+        ));
     }
     for bus in &summary.buses {
         let of_cells = summary.cells.iter().filter(|cell| cell.bus == bus.name).map(|cell| cell.restarts);
@@ -292,7 +302,7 @@ fn add_restart_findings(look_at: &mut Vec<String>, summary: &Summary) {
     if ended > 0 {
         let why = summary.halts.first().map_or("", |halt| &halt.reason);
         look_at.push(format!(
-            "the robot was halted {} and resumed; the first reason: {why}",
+            "the robot was halted {} and resumed; the reason for the first halt: {why}",
             occurrence_count_text(ended)
         ));
     }
@@ -304,7 +314,7 @@ fn add_recording_findings(look_at: &mut Vec<String>, summary: &Summary) {
     // If the run failed, its error already names the file that could not be written.
     if recording.lost + messages > 0 && summary.failure.is_none() {
         look_at.push(format!(
-            "the recording is incomplete, it lacks {} and {}: this machine was busy, or its disk is slow",
+            "the recording is incomplete: it lacks {} and {}, because this machine was busy or its disk is slow",
             count_noun(recording.lost, "frame", "frames"),
             count_noun(messages, "other message", "other messages")
         ));
@@ -317,7 +327,7 @@ fn add_explained_losses(look_at: &mut Vec<String>, bus: &BusSummary) {
     let reasons = [
         (replies.lost, "lost on the way to the gateway"),
         (replies.not_heard, "not sent, because the cell did not receive the joints"),
-        (replies.in_doubt, "in doubt, of cells that were silent or restarted, or of a lost bus"),
+        (replies.in_doubt, "uncertain, because the cell was silent or restarted, or the bus was lost"),
     ];
     let missing = nonzero_counts(reasons);
     if !missing.is_empty() {
@@ -326,19 +336,19 @@ fn add_explained_losses(look_at: &mut Vec<String>, bus: &BusSummary) {
     let reasons = [
         (up.dropped, "dropped by the bus, because this machine did not read them in time"),
         (up.backlog, "dropped by the kernel's backlog (net.core.netdev_max_backlog)"),
-        (up.outage, "lost with the bus"),
+        (up.outage, "lost while the bus was down"),
         (up.hosts, "lost between hosts"),
         (up.rejected, "damaged"),
-        (up.in_doubt, "in doubt, from before a restart"),
-        (up.surplus, "more than their cells have sent: duplicates, or another sender"),
+        (up.in_doubt, "uncertain, because the cell restarted afterwards"),
+        (up.surplus, "more than the cells sent: duplicates, or from another sender"),
     ];
     let packets = nonzero_counts(reasons);
     if !packets.is_empty() {
-        look_at.push(format!("packets of cells on {name}: {}", packets.join(", ")));
+        look_at.push(format!("packets from cells on {name}: {}", packets.join(", ")));
     }
     if bus.dropped_by_bus > up.dropped {
         look_at.push(format!(
-            "{} of any sender dropped by {name}, because this machine did not read them in time",
+            "{} from any sender dropped by {name}, because this machine did not read them in time",
             count_noun(bus.dropped_by_bus - up.dropped, "frame", "frames")
         ));
     }
@@ -350,16 +360,20 @@ fn add_control_findings(look_at: &mut Vec<String>, summary: &Summary) {
     if bad > 0 {
         let worst = control.bad_cycles.iter().max_by_key(|(_, count)| **count);
         let why = worst.map_or("", |(reason, _)| reason);
-        look_at.push(format!("{}, most of them because {why}", count_noun(bad, "bad cycle", "bad cycles")));
+        look_at.push(format!(
+            "{}, mostly because {why}",
+            count_noun(bad, "bad control cycle", "bad control cycles")
+        ));
     }
     if control.unsent > 0 {
         let frames = count_noun(control.unsent, "frame", "frames");
-        look_at.push(format!("{frames} of the gateway were not sent: a bus refused them"));
+        look_at.push(format!("the gateway could not send {frames}, because a bus refused them"));
     }
     if control.records_lost > 0 {
         let records = count_noun(control.records_lost, "record of a tick", "records of ticks");
-        look_at
-            .push(format!("{records} lost, so figures of the control loop lack them: this machine was busy"));
+        look_at.push(format!(
+            "{records} missing in the figures of the control loop, because this machine was busy"
+        ));
     }
 }
 
@@ -373,7 +387,7 @@ fn add_tick_findings(look_at: &mut Vec<String>, summary: &Summary) {
             joints => format!(", {joints} of them with a joints message"),
         };
         look_at.push(format!(
-            "{} of {} of the control loop skipped{joints}: this machine was busy{fifo}",
+            "the control loop skipped {} of {}{joints}: this machine was busy{fifo}",
             control.ticks_skipped,
             count_noun(control.ticks + control.ticks_skipped, "tick", "ticks")
         ));
@@ -385,21 +399,21 @@ fn add_late_replies(look_at: &mut Vec<String>, bus: &BusSummary) {
     let RepliesSummary { due, late, too_late, skipped, .. } = bus.replies;
     let parts = nonzero_counts([
         (late + too_late, "late"),
-        (skipped, "skipped by cells that received the joints too late"),
+        (skipped, "skipped, because the cells received the joints too late"),
     ]);
     if !parts.is_empty() {
         look_at.push(format!(
-            "{} of {} on {}: this machine was busy, or the cells are slow; -v has the times",
-            parts.join(" and "),
-            count_noun(due, "reply", "replies"),
-            bus.name
+            "{} on {}: {}; this machine was busy, or the cells are slow; -v shows the times",
+            count_noun(due, "reply due", "replies due"),
+            bus.name,
+            parts.join(", ")
         ));
     }
     if let Some(parts) = bus.sums.map(|sums| sums.contributions).filter(|parts| parts.late > 0) {
         look_at.push(format!(
-            "{} of {} due in sums were late on {}: this machine was busy, or the tree is deep",
+            "{} of {} were late on {}: this machine was busy, or the tree is deep",
             parts.late,
-            count_noun(parts.due, "cell", "cells"),
+            count_noun(parts.due, "contribution to sums", "contributions to sums"),
             bus.name
         ));
     }
@@ -413,7 +427,7 @@ fn add_incomplete_epochs(look_at: &mut Vec<String>, bus: &BusSummary) {
     let missing = bus.epochs_due.saturating_sub(bus.epochs_complete);
     if missing > 0 && !explained {
         look_at.push(format!(
-            "{} of {} not complete on {}",
+            "{} of {} were not complete on {}",
             missing,
             count_noun(bus.epochs_due, "epoch", "epochs"),
             bus.name
@@ -430,7 +444,11 @@ fn add_irregular_frames(look_at: &mut Vec<String>, bus: &BusSummary) {
     });
     let odd = nonzero_counts(odd);
     if !odd.is_empty() {
-        look_at.push(format!("anomalies on {}: {}; skinbus dump shows the frames", bus.name, odd.join(", ")));
+        look_at.push(format!(
+            "anomalies on {}: {}; `skinbus dump` shows the frames",
+            bus.name,
+            odd.join(", ")
+        ));
     }
 }
 
@@ -438,12 +456,12 @@ fn add_irregular_frames(look_at: &mut Vec<String>, bus: &BusSummary) {
 fn add_unchecked_findings(look_at: &mut Vec<String>, summary: &Summary) {
     for cells in cells_where(summary, |cell| cell.contact_unknown > 0 && !cell.is_measuring()) {
         look_at.push(format!(
-            "{cells}: contact unknown, so torques were not compared; the cause is stimuli from before this run, or a baseline"
+            "{cells}: contact unknown, because of stimuli from before this run or a baseline; torques not compared"
         ));
     }
     for cells in cells_where(summary, CellSummary::is_measuring) {
         look_at.push(format!(
-            "{cells}: in mode \"measure\" and not pressed by the scenario, so torques were not compared"
+            "{cells}: in mode \"measure\" and not pressed by the scenario; torques not compared"
         ));
     }
     // If the run failed early, its error is already in the list.
@@ -454,11 +472,12 @@ fn add_unchecked_findings(look_at: &mut Vec<String>, summary: &Summary) {
     let compared = summary.accuracy.single.count() + summary.accuracy.sums.count();
     if summary.buses.iter().map(due).sum::<u64>() == 0 {
         look_at.push(
-            "no torque was due: no cell was in contact, so nothing was compared; --scenario FILE touches cells".to_owned(),
+            "no torque was due, because no cell was in contact: use --scenario FILE to touch cells"
+                .to_owned(),
         );
     } else if compared == 0 {
         look_at.push(
-            "no torque was compared with the central computation: none came in time while the mode was \"compare\""
+            "no torque was compared with the central computation: none arrived in time while the mode was \"compare\""
                 .to_owned(),
         );
     }

@@ -183,7 +183,10 @@ fn cells_on_an_arm_of_seven_joints_are_found() {
             );
         }
         let advice = calibration.cells[0].troubles[0].to_string();
-        assert!(advice.ends_with("no motion of this robot would help; its description is kept"), "{advice}");
+        assert!(
+            advice.ends_with("no motion of this robot would help; its pose in the skin is kept",),
+            "{advice}"
+        );
         errors.add(&skin, &calibration, |_, result| determined(result));
     }
     errors.check("panda", 3.0);

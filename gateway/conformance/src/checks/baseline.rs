@@ -77,7 +77,7 @@ fn request_baseline(
         pages.iter().find_map(|page| if let SensorPage::Skin(skin) = page { Some(*skin) } else { None });
     let zero = pages.iter().find_map(baseline_page);
     session.check("BASE-7", zero.is_some(), || {
-        "a report must be answered with sensors page 3, but that page did not come".to_owned()
+        "the cell must answer a report with sensors page 3, but it did not send that page".to_owned()
     });
     let sum = |skin: SkinSensors| skin.contact.iter().map(|word| i32::from(word.to_bits())).sum();
     Ok(skin.zip(zero).map(|(skin, zero)| (sum(skin), zero, skin)))
@@ -126,7 +126,11 @@ fn check_rule_ranges(session: &mut Session<'_>) -> Result<(), StopReason> {
     for (number, bad) in cases.chain([3, -1, 1, 2].map(|word| (TARE_PARAMETER, padded_words([word])))) {
         let reply = session.write_parameter(number, bad)?;
         session.check("BASE-1", reply == Reply::Refused(19), || {
-            format!("parameter {number} must refuse {} with reason 19 while the baseline is off, but the answer was {reply}", Reply::Value(bad))
+            format!(
+                "while the baseline is off, the cell must refuse a write of {} to parameter {number} with \
+                 reason 19, but the answer was {reply}",
+                Reply::Value(bad)
+            )
         });
     }
     for (written, expected) in
@@ -134,13 +138,18 @@ fn check_rule_ranges(session: &mut Session<'_>) -> Result<(), StopReason> {
     {
         let reply = session.write_parameter(BASELINE_PARAMETER, written)?;
         session.check("CONF-3", reply == Reply::Value(expected), || {
-            format!("parameter 11 was written with {}, whose unused words must become 0, but the answer was {reply}", Reply::Value(written))
+            format!(
+                "a write of {} to parameter 11 must be answered with 0 in the unused words, but the answer \
+                 was {reply}",
+                Reply::Value(written)
+            )
         });
     }
     write_rule(session, [0; WORDS])?;
     let step = send_reading(session, 307, TEMPERATURE_25_C, 1)?;
     session.check("BASE-1", step.torque.is_some(), || {
-        "while the baseline is off, 0.3 N must give a torque, but none came".to_owned()
+        "while the baseline is off, a force of 0.3 N must cause a torque message, but the cell sent none"
+            .to_owned()
     });
     send_reading(session, 0, TEMPERATURE_25_C, 2)?;
     Ok(())
@@ -150,19 +159,26 @@ fn check_first_tare(session: &mut Session<'_>) -> Result<(), StopReason> {
     write_rule(session, HELD_ZERO_RULE)?;
     let first = send_reading(session, 307, TEMPERATURE_25_C, 1)?;
     session.check("BASE-2", first.torque.is_none_or(|torque| torque.is_zero()), || {
-        "0.3 N before the first tare is within the limit of 0.5 N and must not give a torque, but one came".to_owned()
+        "a force of 0.3 N before the first tare is within the limit of 0.5 N and must not cause a torque \
+         message, but the cell sent one"
+            .to_owned()
     });
     send_reading(session, 307, TEMPERATURE_25_C, JOINTS_BEFORE_TARE)?;
     if let Some((sum, zero, _)) = request_baseline(session)? {
         let is_so = zero.tared && is_near(zero.zero.to_bits().into(), 307, 1) && is_near(sum, 0, 1);
         session.check("BASE-2", is_so, || {
-            format!("after {JOINTS_BEFORE_TARE} joints messages at 0.3 N, page 3 must show a tared zero of 307 steps, and the contact words of page 0 must sum to 0, but page 3 is {}, and the sum is {sum}", format_baseline(zero))
+            format!(
+                "after {JOINTS_BEFORE_TARE} joints messages at 0.3 N, sensors page 3 must report a tared \
+                 zero of 307 steps and the contact words of page 0 must add up to 0, but page 3 is {} and \
+                 the sum is {sum}",
+                format_baseline(zero)
+            )
         });
     }
     let raw = skin_reading(307 + TOUCH_SUM, TEMPERATURE_25_C);
     let step = send_reading(session, 307 + TOUCH_SUM, TEMPERATURE_25_C, 1)?;
     session.check("BASE-8", step.torque.is_some(), || {
-        "1 N above the zero must give a torque, but none came".to_owned()
+        "a force of 1 N above the zero must cause a torque message, but the cell sent none".to_owned()
     });
     if let Some((_, zero, skin)) = request_baseline(session)? {
         let zero = i32::from(zero.zero.to_bits());
@@ -176,7 +192,8 @@ fn check_first_tare(session: &mut Session<'_>) -> Result<(), StopReason> {
         let got: Vec<_> = skin.contact.iter().map(|word| i32::from(word.to_bits())).collect();
         session.check("BASE-8", got == expected, || {
             format!(
-                "with a zero of {zero} steps page 0 must have the contact words {expected:?}, but has {got:?}"
+                "with a zero of {zero} steps, the contact words of sensors page 0 must be {expected:?}, but \
+                 they are {got:?}"
             )
         });
     }
@@ -184,11 +201,17 @@ fn check_first_tare(session: &mut Session<'_>) -> Result<(), StopReason> {
     write_rule(session, HELD_ZERO_RULE)?;
     let step = send_reading(session, 700, TEMPERATURE_25_C, JOINTS_BEFORE_TARE)?;
     session.check("BASE-2", step.torque.is_some(), || {
-        "0.68 N from the start is beyond the limit of 0.5 N and must give a torque, but none came".to_owned()
+        "a force of 0.68 N from the start is beyond the limit of 0.5 N and must cause a torque message, but \
+         the cell sent none"
+            .to_owned()
     });
     if let Some((sum, zero, _)) = request_baseline(session)? {
         session.check("BASE-2", !zero.tared && sum == 700, || {
-            format!("0.68 N from the start must not be tared, and the contact words of page 0 must sum to 700, but page 3 is {}, and the sum is {sum}", format_baseline(zero))
+            format!(
+                "a force of 0.68 N from the start must not be tared, and the contact words of sensors page 0 \
+                 must add up to 700, but page 3 is {} and the sum is {sum}",
+                format_baseline(zero)
+            )
         });
     }
     Ok(())
@@ -203,9 +226,17 @@ fn check_zero_held(session: &mut Session<'_>) -> Result<(), StopReason> {
     for joints in [1, 60] {
         send_reading(session, TOUCH_SUM, TEMPERATURE_25_C, joints)?;
         if let Some((sum, zero, _)) = request_baseline(session)? {
-            session.check("BASE-3", is_near(sum, TOUCH_SUM, 1) && is_near(zero.zero.to_bits().into(), 0, 1), || {
-                format!("after {joints} joints messages at 1 N the zero must be 0, and the contact words of page 0 must sum to {TOUCH_SUM}, but page 3 is {}, and the sum is {sum}", format_baseline(zero))
-            });
+            session.check(
+                "BASE-3",
+                is_near(sum, TOUCH_SUM, 1) && is_near(zero.zero.to_bits().into(), 0, 1),
+                || {
+                    format!(
+                        "after {joints} joints messages at 1 N, the zero must be 0 and the contact words of \
+                     sensors page 0 must add up to {TOUCH_SUM}, but page 3 is {} and the sum is {sum}",
+                        format_baseline(zero)
+                    )
+                },
+            );
         }
     }
     send_reading(session, 0, TEMPERATURE_25_C, 2)?;
@@ -225,7 +256,8 @@ fn check_zero_tracking(session: &mut Session<'_>) -> Result<(), StopReason> {
         let is_so = (min..=max).contains(&steps) || skips != session.skips;
         session.check("BASE-4", is_so, || {
             format!(
-                "after {JOINTS_MESSAGES} joints messages with a reading of 80 steps, at a rate of {} uN/s, the zero must be {min} to {max} steps, but is {steps}",
+                "after {JOINTS_MESSAGES} joints messages with a reading of 80 steps and a rate of {} uN/s, \
+                 the zero must be {min} to {max} steps, but it is {steps}",
                 rate.cast_unsigned()
             )
         });
@@ -243,7 +275,8 @@ fn check_temperature(session: &mut Session<'_>) -> Result<(), StopReason> {
         if let Some((sum, zero, _)) = request_baseline(session)? {
             session.check("BASE-5", is_near(sum, TOUCH_SUM - expected, 2), || {
                 format!(
-                    "after a change by {degrees} °C with a slope of 0.02 N/°C page 3 is {}, and the contact words of page 0 sum to {sum}, but must sum to {}",
+                    "after a temperature change of {degrees} °C with a slope of 0.02 N/°C, sensors page 3 is \
+                     {} and the contact words of page 0 add up to {sum}, but they must add up to {}",
                     format_baseline(zero),
                     TOUCH_SUM - expected
                 )
@@ -269,7 +302,8 @@ fn check_tare_requests(session: &mut Session<'_>) -> Result<(), StopReason> {
             let is_so = is_near(zero.zero.to_bits().into(), expected, 2) && is_counted;
             session.check("BASE-6", is_so, || {
                 format!(
-                    "{what}, page 3 must have a zero of {expected} steps and the number of refused tares, but is {}",
+                    "{what}, sensors page 3 must report a zero of {expected} steps and the number of refused \
+                     tares, but it is {}",
                     format_baseline(zero)
                 )
             });
@@ -278,20 +312,20 @@ fn check_tare_requests(session: &mut Session<'_>) -> Result<(), StopReason> {
     };
     send_reading(session, 300, TEMPERATURE_25_C, 40)?;
     let before = request_baseline(session)?.map(|(_, zero, _)| zero.refused.wrapping_add(1));
-    tare(session, 1, Reply::Refused(REFUSAL_REASON_TOUCHED), "touched with 0.3 N")?;
-    zero_is(session, 0, before, "after a tare that was refused")?;
-    tare(session, 2, Reply::Value(padded_words([1])), "touched, forced")?;
+    tare(session, 1, Reply::Refused(REFUSAL_REASON_TOUCHED), "tare of a cell that is touched with 0.3 N")?;
+    zero_is(session, 0, before, "after a refused tare")?;
+    tare(session, 2, Reply::Value(padded_words([1])), "forced tare of a touched cell")?;
     zero_is(session, 300, None, "after a forced tare at 0.3 N")?;
     send_reading(session, 250, TEMPERATURE_25_C, 40)?;
-    tare(session, 1, Reply::Value(padded_words([1])), "not touched")?;
+    tare(session, 1, Reply::Value(padded_words([1])), "tare of a cell that is not touched")?;
     zero_is(session, 250, None, "after a tare at 0.24 N")?;
     send_reading(session, 800, TEMPERATURE_25_C, 40)?;
-    tare(session, 2, Reply::Refused(REFUSAL_REASON_BEYOND_LIMIT), "forced, beyond the limit of 0.5 N")?;
+    tare(session, 2, Reply::Refused(REFUSAL_REASON_BEYOND_LIMIT), "forced tare beyond the limit of 0.5 N")?;
     zero_is(session, 250, None, "after a tare beyond the limit")?;
-    tare(session, 0, Reply::Value([0; WORDS]), "to forget the zero")?;
+    tare(session, 0, Reply::Value([0; WORDS]), "discard the zero")?;
     let reply = session.read_parameter(TARE_PARAMETER)?;
     session.check("BASE-6", reply == Reply::Value([0; WORDS]), || {
-        format!("without a zero, parameter 12 must read as 0, but reads as {reply}")
+        format!("after the zero is discarded, parameter 12 must read as 0, but it reads as {reply}")
     });
     Ok(())
 }
@@ -305,7 +339,10 @@ fn check_baseline_pages(session: &mut Session<'_>) -> Result<(), StopReason> {
         let came = pages.find_map(|(_, page)| baseline_page(page));
         session.check("BASE-7", came.is_some_and(|page| page.touched == touched), || {
             let came = came.map_or_else(|| "none".to_owned(), format_baseline);
-            format!("the start or end of a touch must send page 3 with the new touch state, but {came} came")
+            format!(
+                "when a touch starts or ends, the cell must send sensors page 3 with the new touch state, \
+                 but it sent {came}"
+            )
         });
     }
     session.wait_for_heartbeat_gap(Span::from_millis(60))?;
@@ -317,7 +354,10 @@ fn check_baseline_pages(session: &mut Session<'_>) -> Result<(), StopReason> {
     let count = pages.filter(|(_, page)| baseline_page(page).is_some()).count();
     session.mark_packets_expected();
     session.check("BASE-7", count >= beats / 4 && count <= beats / 4 + 1, || {
-        format!("page 3 must come with every fourth heartbeat, but came {count} times in {beats} heartbeats")
+        format!(
+            "the cell must send sensors page 3 with every fourth heartbeat, but it sent the page {count} \
+             times in {beats} heartbeats"
+        )
     });
     Ok(())
 }

@@ -24,7 +24,8 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     if session.about.test_mode && session.about.committed {
         check_early_heartbeats(session)?;
     } else {
-        session.findings.mark_not_tested("BEAT-2", "without test mode nothing presses the cell");
+        let why = "without test mode (parameter 5), the test cannot simulate a touch";
+        session.findings.mark_not_tested("BEAT-2", why);
     }
     let last = check_held_state(session)?;
     if let (Some(first), Some(last)) = (first, last) {
@@ -66,7 +67,7 @@ fn check_held_state(session: &mut Session<'_>) -> Result<Option<HeartbeatGrid>, 
         session.packets.get(first..).unwrap_or_default().iter().filter_map(CellPacket::heartbeat_and_epoch);
     let is_halted = beats.clone().all(|(beat, _)| beat.state.has(State::HALTED));
     session.check("CMD-1", is_halted, || {
-        "HALTED must stay set until a resume, but a heartbeat came without it".to_owned()
+        "HALTED must stay set until a resume, but the cell sent a heartbeat without it".to_owned()
     });
     session.send_next_joints(&[0; MAX_JOINTS])?;
     session.send_messages(&[Message::Resume])?;
@@ -75,7 +76,9 @@ fn check_held_state(session: &mut Session<'_>) -> Result<Option<HeartbeatGrid>, 
         let step = session.send_next_joints(&[0; MAX_JOINTS])?;
         let is_there = step.torque.is_some();
         session.check("STIM-7", is_there, || {
-            "a latched stimulus must hold for more than 2 s, but no torque came after that time".to_owned()
+            "a latched stimulus must stay in effect for more than 2 s, but the cell sent no torque message \
+             after that time"
+                .to_owned()
         });
         session.stimulate_and_send_joints(&[0; MAX_JOINTS], arm::press_with_sum(0))?;
     }
@@ -101,7 +104,12 @@ fn check_regular_heartbeats(session: &mut Session<'_>, ms: u64) -> Result<Option
             (due..=due + 1).contains(&times.len()) && apart.iter().all(|span| (from..=to).contains(span));
         if is_so || attempt == 2 || late.0 < 1_000 {
             session.check("BEAT-1", is_so, || {
-                format!("a heartbeat is due every 250 ms, at most 20 ms late, but {} came in {ms} ms, {} ms apart", times.len(), format_ms(apart.iter().copied()))
+                format!(
+                    "the cell must send a heartbeat every 250 ms, at most 20 ms late, but it sent {} in {ms} \
+                     ms, at intervals of {} ms",
+                    times.len(),
+                    format_ms(apart.iter().copied())
+                )
             });
             let due = times
                 .iter()
@@ -148,8 +156,8 @@ fn check_heartbeats_not_shifted(session: &mut Session<'_>) -> Result<(), StopRea
                 session.check("BEAT-3", is_so, || {
                     let times = format_ms(times.iter().map(|at| at - grid.0));
                     format!(
-                        "with {what} {offset} ms after a regular heartbeat, heartbeats must come {offset}, 250 and 500 ms \
-                         after it, but came {times} ms after it"
+                        "when {what} arrives {offset} ms after a regular heartbeat, further heartbeats must \
+                         follow {offset}, 250 and 500 ms after the first, but they followed after {times} ms"
                     )
                 });
                 break;
@@ -165,7 +173,9 @@ fn next_beat(session: &mut Session<'_>) -> Result<Option<Micros>, StopReason> {
     let until = session.now() + Span(HEARTBEAT_INTERVAL_US + MAX_LATENESS_US + 50_000);
     let came =
         session.wait_for_packets(until, |heard| heard.iter().any(|it| it.heartbeat_and_epoch().is_some()))?;
-    session.check("BEAT-1", came, || "a heartbeat is due every 250 ms, but none came for 320 ms".to_owned());
+    session.check("BEAT-1", came, || {
+        "the cell must send a heartbeat every 250 ms, but it sent none for 320 ms".to_owned()
+    });
     let at = session.answers().iter().rev().find(|it| it.heartbeat_and_epoch().is_some()).map(|it| it.at);
     session.mark_packets_expected();
     Ok(at)
@@ -213,8 +223,8 @@ fn check_early_heartbeats(session: &mut Session<'_>) -> Result<(), StopReason> {
                 session.check("BEAT-2", is_so, || {
                     let times = format_ms(times.iter().map(|at| at.saturating_sub(grid.0)));
                     format!(
-                        "with joints every 16 ms, heartbeats must come 250, 500, 750 and 1000 ms after a regular one, or up to \
-                         16 ms earlier, but came {times} ms after it"
+                        "with a joints message every 16 ms, heartbeats must follow 250, 500, 750 and 1000 ms \
+                         after a regular one, or up to 16 ms earlier, but they followed after {times} ms"
                     )
                 });
                 break;
@@ -238,7 +248,8 @@ fn check_torque_before_heartbeat(session: &mut Session<'_>) {
         .count();
     session.check("TIME-3", first <= 1, || {
         format!(
-            "a regular heartbeat must follow the torque of its epoch, but {first} heartbeats came before it"
+            "a regular heartbeat must follow the torque message of its epoch, but {first} heartbeats \
+             preceded it"
         )
     });
 }

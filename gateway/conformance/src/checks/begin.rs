@@ -26,7 +26,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     if session.known.hash == Some(0) {
         unconfigured::run(session)?;
     } else {
-        let why = "joints without a configuration: the cell had a configuration";
+        let why = "joints messages to an unconfigured cell, because this cell has a configuration";
         session.findings.mark_not_tested("JOINTS-2", why);
     }
     let document = arm::example_parameters(2);
@@ -45,19 +45,21 @@ fn check_identity(session: &mut Session<'_>) -> Result<(), StopReason> {
         return Ok(());
     };
     session.check("CONF-1", version == i16::from(VERSION), || {
-        format!("the identity must have version 1, but has {version}")
+        format!("the identity (parameter 0) must have protocol version 1, but it has {version}")
     });
     let exchange = session.exchange_messages(&[])?;
     let Some((beat, _)) = exchange.beat else { return Ok(()) };
     session.check("CONF-1", hash.cast_unsigned() == beat.configuration, || {
         format!(
-            "identity and heartbeat must have the same configuration, but have {hash:04X} and {:04X}",
+            "the identity and the heartbeat must report the same configuration, but they report {hash:04X} \
+             and {:04X}",
             beat.configuration
         )
     });
     session.check("CONF-1", state.cast_unsigned() == beat.state.0, || {
         format!(
-            "identity and heartbeat must have the same state, but have {state:04X} and {:04X}",
+            "the identity and the heartbeat must report the same state, but they report {state:04X} and \
+             {:04X}",
             beat.state.0
         )
     });

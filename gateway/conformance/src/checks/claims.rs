@@ -74,20 +74,25 @@ fn check_claim_defence(session: &mut Session<'_>, serial: u32) -> Result<(), Sto
     let came = session.wait_for_packets(at + Span::from_millis(120), |heard| {
         heard.iter().any(|it| it.heartbeat_and_epoch().is_some())
     })?;
-    session.check("CLAIM-6", came, || format!("a claim of the cell's node id with serial number {serial} must be answered with a heartbeat, but none came"));
+    session.check("CLAIM-6", came, || {
+        format!(
+            "the cell must answer a claim of its node id by serial number {serial} with a heartbeat, but it \
+             sent none"
+        )
+    });
     if let Some((answered, state)) = heartbeat_states(session).first().copied() {
         session.record_answer_time("heartbeat to a claimant", at, answered);
         session.check("CLAIM-7", state.has(State::DUPLICATE), || {
             format!("DUPLICATE must be set in the answer to a claim, but the state is {:04X}", state.0)
         });
         session.check("CLAIM-6", !state.has(State::CLAIMING_NODE_ID), || {
-            "CLAIMING must be clear in the answer of a settled cell to a claim, but is set".to_owned()
+            "a settled cell must clear CLAIMING in its answer to a claim, but CLAIMING is set".to_owned()
         });
     }
     session.receive_for(Span::from_millis(5))?;
     let count = heartbeat_states(session).len();
     session.check("CLAIM-6", count <= 1, || {
-        format!("a claim must be answered with one heartbeat, but {count} came")
+        format!("the cell must answer a claim with one heartbeat, but it sent {count}")
     });
     session.mark_packets_expected();
     // The heartbeat that answers the sync is checked as usual.
@@ -99,9 +104,8 @@ fn check_claim_defence(session: &mut Session<'_>, serial: u32) -> Result<(), Sto
 /// others.
 fn check_simultaneous_claims(session: &mut Session<'_>, own: u32) -> Result<(), StopReason> {
     if session.are_answers_slow() {
-        session
-            .findings
-            .mark_not_tested("CLAIM-6", "claims within 10 ms: the connection to the cell is too slow");
+        let why = "claims within 10 ms, because the connection to the cell is too slow";
+        session.findings.mark_not_tested("CLAIM-6", why);
         return Ok(());
     }
     for _ in 0..3 {
@@ -124,7 +128,7 @@ fn check_simultaneous_claims(session: &mut Session<'_>, own: u32) -> Result<(), 
         }
         session.check("CLAIM-6", count == 1, || {
             format!(
-                "three claims within {} us must be answered with one heartbeat, but {count} came",
+                "the cell must answer three claims within {} us with one heartbeat, but it sent {count}",
                 apart.0
             )
         });
@@ -136,14 +140,15 @@ fn check_simultaneous_claims(session: &mut Session<'_>, own: u32) -> Result<(), 
         })?;
         let is_set = heartbeat_states(session).first().is_some_and(|(_, state)| state.has(State::DUPLICATE));
         session.check("CLAIM-7", is_set, || {
-            "DUPLICATE must be set in the heartbeat after a claim that was not answered, but is clear"
+            "DUPLICATE must be set in the heartbeat after a claim that was not answered, but it is clear"
                 .to_owned()
         });
         session.mark_packets_expected();
         session.exchange_messages(&[])?;
         return Ok(());
     }
-    session.findings.mark_not_tested("CLAIM-6", "claims within 10 ms: the bench was late each time");
+    let why = "claims within 10 ms, because this computer was late in every attempt";
+    session.findings.mark_not_tested("CLAIM-6", why);
     Ok(())
 }
 
@@ -155,7 +160,8 @@ fn check_non_claim_unanswered(session: &mut Session<'_>, other: &Message) -> Res
     session.receive_for(Span::from_millis(25))?;
     let count = heartbeat_states(session).len();
     session.check("CLAIM-6", count == 0, || {
-        "a 4nn that is not a claim must not be answered, but a heartbeat came".to_owned()
+        "the cell must not answer a network packet (4nn) that is not a claim, but it sent a heartbeat"
+            .to_owned()
     });
     session.mark_packets_expected();
     // A read of the identity shows DUPLICATE, and does not clear it.
@@ -164,7 +170,8 @@ fn check_non_claim_unanswered(session: &mut Session<'_>, other: &Message) -> Res
     let is_set = shown.has(State::DUPLICATE);
     session.check("CONF-1", is_set, || {
         format!(
-            "DUPLICATE must be set in the identity after a network packet (4nn) of another cell, but the state is {:04X}",
+            "after another cell has sent a network packet with the same node id, DUPLICATE must be set in \
+             the identity, but the state is {:04X}",
             shown.0
         )
     });
@@ -176,7 +183,8 @@ fn check_non_claim_unanswered(session: &mut Session<'_>, other: &Message) -> Res
     let state = heartbeat_states(session).last().map(|(_, state)| *state).unwrap_or_default();
     session.check("CLAIM-7", state.has(State::DUPLICATE), || {
         format!(
-            "DUPLICATE must be set in the heartbeat after a network packet (4nn) of another cell, but the state is {:04X}",
+            "after another cell has sent a network packet with the same node id, DUPLICATE must be set in \
+             the next heartbeat, but the state is {:04X}",
             state.0
         )
     });

@@ -38,7 +38,8 @@ fn check_command(
     }
     let exchange = session.exchange_messages(&[command])?;
     session.check(id, exchange.is_silent(), || {
-        "the command must not be answered, but packets came besides the heartbeat to the sync after it"
+        "the cell must not answer a halt or a resume, but it sent packets besides the heartbeat for the next \
+         sync"
             .to_owned()
     });
     let is_set = exchange.state().has(State::HALTED);
@@ -74,7 +75,9 @@ fn check_answer_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
             if came == expected || attempt == MAX_CHECK_ATTEMPTS {
                 session.check(id, came == expected, || {
                     let halted = if expected > 0 { " to a halted cell" } else { "" };
-                    format!("{what}{halted} must be answered with {expected} packets, but {came} came")
+                    format!(
+                        "{what}{halted} must be answered with {expected} packets, but the cell sent {came}"
+                    )
                 });
                 break;
             }
@@ -93,7 +96,7 @@ fn check_halt(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.stimulate_and_send_joints(&FIRST_POSITIONS, unit)?;
         let exchange = check_command(session, Message::Halt, "CMD-1")?;
         session.check("STATE-1", !exchange.state().has(State::ACTIVE), || {
-            "ACTIVE must be clear after a halt, but is set".to_owned()
+            "ACTIVE must be clear after a halt, but it is set".to_owned()
         });
         if round == 1 {
             check_command(session, Message::Halt, "CMD-1")?;
@@ -117,10 +120,10 @@ fn check_halt(session: &mut Session<'_>) -> Result<(), StopReason> {
         let taken = |of: &protocol::message::ReceivedCounts| of.joints.wrapping_add(of.joints_late);
         let counted = taken(&after).wrapping_sub(taken(&before));
         session.check("CMD-1", counted == 5, || {
-            format!("a halted cell must count 5 joints messages, but counted {counted}")
+            format!("a halted cell must count 5 joints messages, but it counted {counted}")
         });
         session.check("CMD-1", after.torques == before.torques, || {
-            "a halted cell must not count torques, but its count changed".to_owned()
+            "a halted cell must not count torque messages, but its counter 'torques' changed".to_owned()
         });
         check_command(session, Message::Resume, "CMD-2")?;
         let step = session.send_next_joints(&SECOND_POSITIONS)?;
@@ -134,7 +137,8 @@ fn check_halt(session: &mut Session<'_>) -> Result<(), StopReason> {
             .unwrap_or(0);
         session.check("CMD-2", off <= 8, || {
             format!(
-                "the first torque after a resume must match the new joint positions, but is {}",
+                "the first torque message after a resume must match the new joint positions, but its words \
+                 are {}",
                 arm::format_words(&step.words())
             )
         });
@@ -144,7 +148,8 @@ fn check_halt(session: &mut Session<'_>) -> Result<(), StopReason> {
         check_command(session, Message::Resume, "CMD-2")?;
         let step = session.send_next_joints(&SECOND_POSITIONS)?;
         session.check("CMD-1", step.torque.is_none(), || {
-            "after a release while halted no torque must come, but one came".to_owned()
+            "after a touch has ended during a halt, the cell must send no torque message, but it sent one"
+                .to_owned()
         });
     }
     // A resume does not change a cell that is not halted.
@@ -174,7 +179,9 @@ fn check_syncs(session: &mut Session<'_>) -> Result<(), StopReason> {
     // Regular heartbeats may come between.
     let regular = 1 + usize::try_from(session.now().elapsed_since(began).0 / 250_000).unwrap_or(0);
     session.check("CMD-3", (SYNCS..=SYNCS + regular).contains(&beats), || {
-        format!("{SYNCS} syncs must be answered with one heartbeat each, but {beats} heartbeats came")
+        format!(
+            "the cell must answer each of {SYNCS} syncs with one heartbeat, but it sent {beats} heartbeats"
+        )
     });
     Ok(())
 }
@@ -203,7 +210,7 @@ fn check_report(session: &mut Session<'_>) -> Result<(), StopReason> {
         let epochs_right =
             answers.iter().all(|heard| heard.message.epoch().map(|it| it.0) == session.known.epoch);
         session.check("JOINTS-3", epochs_right, || {
-            "the pages of a report must have the epoch of the last joints, but one has another epoch"
+            "all pages of a report must have the epoch of the last joints message, but one has another epoch"
                 .to_owned()
         });
         let sent: Vec<_> =
@@ -212,14 +219,18 @@ fn check_report(session: &mut Session<'_>) -> Result<(), StopReason> {
         [SensorPage::Skin(skin), page].iter().for_each(|page| latched.set_page(page));
         let latched = latched.simulated_pages();
         session.check("SENSE-1", sent.len() == latched.len(), || {
-            format!("a report must be answered with each latched sensors page, but {} pages came", sent.len())
+            format!(
+                "the cell must answer a report with every latched sensors page, but it sent {} sensors pages",
+                sent.len()
+            )
         });
         session.check("SENSE-2", sent == latched, || {
             let text = |pages: &[SensorPage]| {
                 pages.iter().map(|page| arm::format_page(*page)).collect::<Vec<_>>().join("; ")
             };
             format!(
-                "a report must contain the latched values, but contains {}, while {} is latched",
+                "a report must contain the latched sensor values, but it contains {}; the latched values are \
+                 {}",
                 text(&sent),
                 text(&latched)
             )

@@ -25,11 +25,11 @@ enum RejectCounter {
 impl RejectCounter {
     const fn expected_change_text(self) -> &'static str {
         match self {
-            Self::Length => "only in the counter length",
-            Self::Crc => "only in the counter crc",
-            Self::MaybeForeign => "only in the counter foreign",
-            Self::Meaning => "only in the counter meaning",
-            Self::Incomplete => "only in the counter incomplete",
+            Self::Length => "only in the counter 'length'",
+            Self::Crc => "only in the counter 'crc'",
+            Self::MaybeForeign => "only in the counter 'foreign'",
+            Self::Meaning => "only in the counter 'meaning'",
+            Self::Incomplete => "only in the counter 'incomplete'",
             Self::None => "in no counter",
         }
     }
@@ -46,7 +46,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
         for _ in 0..MAX_CHECK_ATTEMPTS {
             let exchange = session.exchange_frames(&frames)?;
             session.check("COUNT-1", exchange.is_silent(), || {
-                format!("{what} must be dropped, but was answered")
+                format!("the cell must drop {what}, but it answered")
             });
             let has_effect = exchange.state().has(State::HALTED) || exchange.state().has(State::DUPLICATE);
             session.check("COUNT-1", !has_effect, || {
@@ -72,7 +72,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
             }
         }
         session.check("COUNT-1", beats <= 1, || {
-            format!("{what} must be dropped, but was answered with a heartbeat")
+            format!("the cell must drop {what}, but it answered with a heartbeat")
         });
     }
     Ok(())
@@ -101,11 +101,11 @@ fn effective_packets(session: &Session<'_>) -> Vec<(&'static str, Packet)> {
     vec![
         ("a halt", packet(Id::command(Command::Halt), [0; 6], 0, 0)),
         ("a sync", packet(Id::command(Command::Sync), [0; 6], 0, 0)),
-        ("joints", packet(Id::command(Command::Joints), [1, 2, 3, 4, 5, 6], 250, 6)),
+        ("a joints message", packet(Id::command(Command::Joints), [1, 2, 3, 4, 5, 6], 250, 6)),
         ("a report", packet(Id::command(Command::Report), [0; 6], 0, 0)),
-        ("a claim of its node id", packet(Id::new(Kind::Network, own), claim, 0, 0)),
-        ("a read", packet(Id::new(Kind::Configure, own), [0; 6], 8, 0)),
-        ("a read of everyone", packet(Id::new(Kind::Configure, Node::Everyone), [0; 6], 8, 0)),
+        ("a claim of the cell's node id", packet(Id::new(Kind::Network, own), claim, 0, 0)),
+        ("a read request", packet(Id::new(Kind::Configure, own), [0; 6], 8, 0)),
+        ("a read request to everyone", packet(Id::new(Kind::Configure, Node::Everyone), [0; 6], 8, 0)),
         ("a stimulus", packet(Id::new(Kind::Stimulus, own), [999, 0, 0, 0, 0, 0], 0, 0x80)),
         (
             "a stimulus to everyone",
@@ -149,7 +149,7 @@ fn rejected_packet_cases(session: &Session<'_>) -> Vec<(String, Vec<Frame>, Reje
         let mut swapped = bytes.clone();
         swapped.swap(14, 15);
         if swapped != bytes {
-            cases.push((format!("{name} with its CRC's bytes swapped"), framed(&swapped), wrong));
+            cases.push((format!("{name} with swapped CRC bytes"), framed(&swapped), wrong));
         }
         if format == Format::Fd {
             add_wrong_fd_lengths(&mut cases, name, &packet);
@@ -160,7 +160,7 @@ fn rejected_packet_cases(session: &Session<'_>) -> Vec<(String, Vec<Frame>, Reje
                 let short = bytes.get(..*length).unwrap_or_default();
                 let frame = Frame::classic(id, short).into_iter().collect();
                 cases.push((
-                    format!("{length} bytes with the identifier of {name}"),
+                    format!("a frame of {length} bytes with the identifier of {name}"),
                     frame,
                     RejectCounter::Length,
                 ));
@@ -211,7 +211,7 @@ fn add_wrong_fd_lengths(cases: &mut Vec<(String, Vec<Frame>, RejectCounter)>, na
             bytes.extend(crc);
         }
         let frame = Frame::fd(id, BIT_RATE_SWITCH, &bytes).into_iter().collect();
-        cases.push((format!("{name} in {length} bytes"), frame, RejectCounter::Length));
+        cases.push((format!("{name} in a frame of {length} bytes"), frame, RejectCounter::Length));
     }
     let classic = Frame::classic(id, packet.encode().get(..8).unwrap_or_default());
     cases.push((format!("{name} in a classic frame"), classic.into_iter().collect(), RejectCounter::Length));
@@ -232,13 +232,17 @@ fn add_foreign_frames(
     if id < 0x400 {
         let upper = frames_from_bytes(format, id << 18 | EXTENDED, bytes).into_iter().take(1).collect();
         cases.push((
-            format!("{name} with its identifier in the upper 11 of 29 bits"),
+            format!("{name} with its identifier in the upper 11 bits of a 29-bit identifier"),
             upper,
             RejectCounter::MaybeForeign,
         ));
     }
     let remote = Frame::remote(id, 8).into_iter().collect();
-    cases.push((format!("a remote frame of {name}"), remote, RejectCounter::MaybeForeign));
+    cases.push((
+        format!("a remote frame with the identifier of {name}"),
+        remote,
+        RejectCounter::MaybeForeign,
+    ));
 }
 
 /// Adds packets with pages and counts that do not exist, and with identifiers that are undefined or belong to other
@@ -254,7 +258,7 @@ fn add_bad_pages(session: &Session<'_>, cases: &mut Vec<(String, Vec<Frame>, Rej
     for page in [5, 9, 127, 128, 255] {
         let claim = [1, 0, 0, 0, 0, (State::CLAIMING_NODE_ID.0 | 1 << 12).cast_signed()];
         add(
-            format!("a network packet (4nn) with its node id and page {page}"),
+            format!("a network packet (4nn) with the cell's node id and page {page}"),
             packet(Id::new(Kind::Network, own), claim, 0, page),
             RejectCounter::Meaning,
         );
@@ -267,7 +271,11 @@ fn add_bad_pages(session: &Session<'_>, cases: &mut Vec<(String, Vec<Frame>, Rej
     }
     for command in [5, 6, 0x55, 0xFF] {
         let id = Id { kind: Kind::Command, node: command };
-        add(format!("command {command}"), packet(id, [0; 6], 0, 0), RejectCounter::None);
+        add(
+            format!("a command with the unknown number {command}"),
+            packet(id, [0; 6], 0, 0),
+            RejectCounter::None,
+        );
     }
     let own = session.cell.get();
     let near = [own.wrapping_add(1), own.wrapping_sub(1), own ^ 3, own ^ 0x80, 0xFE, 1];
@@ -282,7 +290,10 @@ fn add_bad_pages(session: &Session<'_>, cases: &mut Vec<(String, Vec<Frame>, Rej
             let bytes: Vec<_> = packet.encode().iter().copied().take(length).collect();
             add(format!("a {} packet of node {node}", kind.name()), packet, RejectCounter::None);
             others.push((
-                format!("{length} bytes with the identifier of a {} packet of node {node}", kind.name()),
+                format!(
+                    "a frame of {length} bytes with the identifier of a {} packet of node {node}",
+                    kind.name()
+                ),
                 frames_from_bytes(session.format, id.to_bits().into(), &bytes),
                 RejectCounter::None,
             ));
@@ -294,7 +305,7 @@ fn add_bad_pages(session: &Session<'_>, cases: &mut Vec<(String, Vec<Frame>, Rej
     for count in [0, 7, 14, 200] {
         let words = Words::new(Length::Six, [3; MAX_JOINTS]);
         let packet = Packet { id: joints, words, epoch: Epoch(251), count };
-        add(format!("joints with count {count}"), packet, RejectCounter::Meaning);
+        add(format!("a joints message with count {count}"), packet, RejectCounter::Meaning);
     }
     cases.extend(others);
 }

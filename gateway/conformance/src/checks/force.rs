@@ -72,14 +72,15 @@ fn check_press(
     let is_there = step.torque.is_some_and(|words| !words.is_zero() || force > 0);
     let sensed = || {
         format!(
-            "contact {}, proximity {}",
+            "contact words {} and proximity {}",
             arm::format_words(&skin.contact.map(Q5_10::to_bits)),
             skin.proximity.to_bits()
         )
     };
     session.check(id, is_there == (force > 0), || {
-        let came = if is_there { "a torque came" } else { "no torque came" };
-        format!("with {}, F_z must be {force} steps of 2^-16 N, but {came}", sensed())
+        let came =
+            if is_there { "the cell sent a torque message" } else { "the cell sent no torque message" };
+        format!("with {}, the force F_z must be {force} steps of 2^-16 N, but {came}", sensed())
     });
     if is_there {
         check_torque_words(session, parameters, &known.j, force, &step.words(), id);

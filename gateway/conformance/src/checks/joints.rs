@@ -34,13 +34,18 @@ fn check_epoch_jumps(session: &mut Session<'_>) -> Result<(), StopReason> {
         epoch = epoch.wrapping_add(step);
         let came = session.send_joints_at_epoch(epoch, &POSITIONS)?.torque;
         session.check("JOINTS-1", came.is_some(), || {
-            format!("joints of epoch {epoch}, {} epochs after the last ones, must be answered with a torque, but none came", step.cast_signed())
+            format!(
+                "the cell must answer joints of epoch {epoch}, {} epochs after the last joints, with a \
+                 torque message, but it sent none",
+                step.cast_signed()
+            )
         });
         if let (Some(came), Some(before)) = (came, torque) {
             let words = |words: &Words| arm::format_words(words.as_slice());
             session.check("TORQUE-1", came == before, || {
                 format!(
-                    "the same joints must give the same torque, but gave {}, and {} before",
+                    "the same joint positions must give the same torque words, but they gave {}, and {} \
+                     before",
                     words(&came),
                     words(&before)
                 )
@@ -54,7 +59,8 @@ fn check_epoch_jumps(session: &mut Session<'_>) -> Result<(), StopReason> {
     let late = session.skips;
     session.check("JOINTS-5", skipped <= late, || {
         format!(
-            "{skipped} joints messages were counted as skipped, but only {late} were delayed enough for that"
+            "the cell counted {skipped} joints messages as skipped, but only {late} were delayed enough to \
+             be skipped"
         )
     });
     Ok(())
@@ -71,7 +77,7 @@ fn check_repeated_epochs(session: &mut Session<'_>) -> Result<(), StopReason> {
             let joints = session.joints_message(first, &positions);
             let exchange = session.exchange_messages(&[joints])?;
             session.check("JOINTS-1", exchange.is_silent(), || {
-                format!("repeated joints of epoch {first} must not be answered, but were")
+                format!("the cell must not answer repeated joints of epoch {first}, but it did")
             });
         }
         // A pending stimulus must not be latched by repeated joints.
@@ -80,7 +86,10 @@ fn check_repeated_epochs(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.exchange_messages(&[joints])?;
         let skin = session.read_latched_skin()?;
         session.check("JOINTS-1", skin == Some(arm::press_with_sum(4_096)), || {
-            format!("repeated joints must not latch a stimulus, but {} is latched", arm::format_skin(skin))
+            format!(
+                "a repeated joints message must not latch a stimulus, but {} is latched",
+                arm::format_skin(skin)
+            )
         });
         let second = session.next_epoch();
         session.send_joints_at_epoch(second, &POSITIONS)?;
@@ -90,7 +99,7 @@ fn check_repeated_epochs(session: &mut Session<'_>) -> Result<(), StopReason> {
         let after = session.counters()?.heard;
         let counted = after.joints_repeated.wrapping_sub(before.joints_repeated);
         session.check("JOINTS-1", counted == 3, || {
-            format!("3 repeated joints messages must be counted as repeated, but {counted} were")
+            format!("the cell must count 3 repeated joints messages as repeated, but it counted {counted}")
         });
     }
     Ok(())
@@ -112,13 +121,14 @@ fn check_joint_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
         let skin = session.read_latched_skin()?;
         session.check("JOINTS-2", skin == before_press, || {
             format!(
-                "joints with count {count} must not latch a stimulus, but {} is latched",
+                "a joints message with count {count} must not latch a stimulus, but {} is latched",
                 arm::format_skin(skin)
             )
         });
         session.check("JOINTS-2", exchange.is_silent(), || {
             format!(
-                "joints with count {count} must not be answered, because the chain has 6 joints, but were"
+                "the cell must not answer a joints message with count {count}, because the chain has 6 \
+                 joints, but it did"
             )
         });
         let after = session.counters()?;
@@ -126,12 +136,18 @@ fn check_joint_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
             after.refused.meaning == before.refused.meaning.wrapping_add(1) && after.heard == before.heard;
         let id = if (1..=6).contains(&count) { "JOINTS-2" } else { "COUNT-1" };
         session.check(id, is_so, || {
-            format!("joints with count {count} must be counted only in the counter meaning, but the counters are {after}; before: {before}")
+            format!(
+                "a joints message with count {count} must be counted only in the counter 'meaning', but the \
+                 counters are {after}; before: {before}"
+            )
         });
         // The epoch of the dropped joints does not become the last one.
         let step = session.send_joints_at_epoch(epoch, &POSITIONS)?;
         session.check("JOINTS-2", step.torque.is_some(), || {
-            format!("joints of epoch {epoch} with the right count must be answered after joints with a wrong count, but were not")
+            format!(
+                "after joints with a wrong count, the cell must answer joints of epoch {epoch} with the \
+                 right count, but it did not"
+            )
         });
         before = session.counters()?;
     }
@@ -146,8 +162,9 @@ fn check_joint_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
         let id = if is_repeated { "JOINTS-1" } else { "COUNT-1" };
         session.check(id, (repeated, meaning) == (is_repeated.into(), (!is_repeated).into()), || {
             format!(
-                "joints of the last epoch with count {count} were counted {repeated} times as repeated and {meaning} \
-                 times in the counter meaning; count 5 must be counted once as repeated, and count 0 once in meaning"
+                "the cell counted joints of the last epoch with count {count} {repeated} times as repeated \
+                 and {meaning} times in the counter 'meaning'; it must count those with count 5 once as \
+                 repeated, and those with count 0 once in 'meaning'"
             )
         });
         before = after;
@@ -160,7 +177,10 @@ fn check_joint_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
         let is_so = after.refused.meaning == before.refused.meaning.wrapping_add(1)
             && after.refused.length == before.refused.length;
         session.check("JOINTS-2", is_so, || {
-            format!("joints with count 7 in 20 bytes must be counted in the counter meaning, but the counters are {after}; before: {before}")
+            format!(
+                "a joints message with count 7 in 20 bytes must be counted in the counter 'meaning', but the \
+                 counters are {after}; before: {before}"
+            )
         });
     }
     Ok(())
@@ -203,7 +223,7 @@ pub(super) fn check_old_joints(session: &mut Session<'_>) -> Result<(), StopReas
     if !shown.any {
         session
             .findings
-            .mark_not_tested("JOINTS-4", "the cell processed all joints at once, and skipped none");
+            .mark_not_tested("JOINTS-4", "the cell processed every joints message at once and skipped none");
     }
     session.known.active = None;
     check_no_joints_lost(session)?;
@@ -270,7 +290,9 @@ fn send_joints_burst(
         taken <= u16::from(JOINTS_PER_BURST) && usize::from(torques) == answers.len() && joints >= torques;
     session.check("JOINTS-4", is_so, || {
         format!(
-            "the counters must match the {JOINTS_PER_BURST} joints messages sent and the torques that came, but {joints} messages were counted as joints, {skipped} as skipped and {torques} as torques, and {} torques came",
+            "the counters must match the {JOINTS_PER_BURST} joints messages sent and the torque messages \
+             received, but the cell counted {joints} joints, {skipped} skipped joints and {torques} torques, \
+             and sent {} torque messages",
             answers.len()
         )
     });
@@ -279,7 +301,10 @@ fn send_joints_burst(
         // Skipped joints still count as the last ones, latch stimuli and leave ACTIVE unchanged.
         let page = session.read_latched_skin()?;
         session.check("STIM-8", page == Some(arm::press_with_sum(press)), || {
-            format!("skipped joints must latch a stimulus, but {} is latched", arm::format_skin(page))
+            format!(
+                "a skipped joints message must latch a pending stimulus, but {} is latched",
+                arm::format_skin(page)
+            )
         });
         session.known.epoch = Some(session.known.last_epoch);
         session.known.active = Some(true);
@@ -288,7 +313,8 @@ fn send_joints_burst(
         session.exchange_messages(&[joints])?;
         let again = session.counters()?.heard.joints_repeated.wrapping_sub(after.heard.joints_repeated);
         session.check("JOINTS-3", again == 1, || {
-            "joints with the epoch of skipped ones must be counted as repeated, but were not".to_owned()
+            "a joints message with the epoch of a skipped one must be counted as repeated, but it was not"
+                .to_owned()
         });
     }
     Ok(())
@@ -306,7 +332,8 @@ fn find_old_answer(sent: &[(u8, Micros)], answers: &[(Micros, u8)]) -> Option<St
     });
     let Some([(before, first), (_, epoch)]) = late else { return None };
     Some(format!(
-        "with a period of 1 us, joints of epoch {epoch} must be skipped as too old, but were answered; they came before the answer to epoch {first} at {} us",
+        "with a period of 1 us, the cell must skip joints of epoch {epoch} as too old, but it answered them; \
+         they arrived before the answer to epoch {first} at {} us",
         before.0
     ))
 }

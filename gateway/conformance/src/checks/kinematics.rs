@@ -132,7 +132,8 @@ fn check_jacobian(
     session.check("J-3", off <= most, || {
         let nearest = exact.map(|x| Q1_14::nearest(x).to_bits());
         format!(
-            "J is {}, which is {off} steps off the expected {}, but at most {most} are allowed",
+            "the Jacobian J is {}, which is {off} steps off the expected {}, but at most {most} steps are \
+             allowed",
             arm::format_words(j.get(..joints).unwrap_or_default()),
             arm::format_words(nearest.get(..joints).unwrap_or_default())
         )
@@ -152,7 +153,8 @@ pub(super) fn check_torque_words(
     let joints = usize::from(parameters.joints);
     session.check(id, expected == *words, || {
         format!(
-            "the torque of a force of {force} steps of 2^-16 N is {}, but must be {}, because J is {}",
+            "the torque words for a force of {force} steps of 2^-16 N are {}, but they must be {}, because \
+             the Jacobian J is {}",
             arm::format_words(words.get(..joints).unwrap_or_default()),
             arm::format_words(expected.get(..joints).unwrap_or_default()),
             arm::format_words(j.get(..joints).unwrap_or_default())
@@ -204,7 +206,7 @@ fn check_saturated_jacobian(
         session.check("J-2", is_held, || {
             let word = if sign > 0 { "8000" } else { "7FFF" };
             format!(
-                "with a lever of {:.1} m, J must saturate at {word}, but is {first:04X}",
+                "with a lever of {:.1} m, the Jacobian J must saturate at {word}, but it is {first:04X}",
                 -3.78 * f64::from(sign)
             )
         });

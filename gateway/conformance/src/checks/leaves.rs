@@ -44,13 +44,16 @@ fn check_stimuli_kept(
 ) -> Result<(), StopReason> {
     let is_there = session.send_next_joints(&POSITIONS)?.torque.is_some();
     session.check(id, is_there, || {
-        format!("{what} must keep the latched stimulus, but no torque came after it")
+        format!("{what} must keep the latched stimulus, but the cell sent no torque message after it")
     });
     session.known.skin = Some(arm::press_with_sum(PENDING_CONTACT_SUM));
     session.send_joints_at_epoch(later, &POSITIONS)?;
     let skin = session.read_latched_skin()?;
     session.check(id, skin == Some(arm::press_with_sum(PENDING_CONTACT_SUM)), || {
-        format!("{what} must keep a pending stimulus, but {} is latched at its epoch", arm::format_skin(skin))
+        format!(
+            "{what} must keep a pending stimulus, but at the epoch of the stimulus {} is latched",
+            arm::format_skin(skin)
+        )
     });
     Ok(())
 }
@@ -90,7 +93,7 @@ fn check_state_kept_by_commit(session: &mut Session<'_>) -> Result<(), StopReaso
     let joints = session.joints_message(session.known.last_epoch, &POSITIONS);
     let again = session.exchange_messages(&[joints])?;
     session.check("CONF-7", again.is_silent(), || {
-        "joints repeated after a commit must not be answered, but were".to_owned()
+        "the cell must not answer joints that are repeated after a commit, but it did".to_owned()
     });
     check_stimuli_kept(session, later, "CONF-7", "a commit")?;
     // A halted cell stays halted.
@@ -127,7 +130,7 @@ fn check_mode_write(session: &mut Session<'_>) -> Result<(), StopReason> {
             session.set_test_mode(to, on != 0)?;
             let is_on = session.exchange_messages(&[])?.state().has(protocol::message::State::TEST_MODE);
             session.check("CONF-11", is_on == (on != 0), || {
-                format!("a write of {on} to parameter 5, sent to {to}, must change TEST_MODE, but did not")
+                format!("a write of {on} to parameter 5, sent to {to}, must change TEST_MODE, but it did not")
             });
         }
         let joints = session.joints_message(session.known.last_epoch, &POSITIONS);
@@ -136,7 +139,10 @@ fn check_mode_write(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.known.halted = Some(false);
         let step = session.send_next_joints(&POSITIONS)?;
         session.check("STIM-2", step.torque.is_none(), || {
-            format!("a write of parameter 5, sent to {to}, must clear stimuli, but a torque came after it")
+            format!(
+                "a write of parameter 5, sent to {to}, must clear all stimuli, but the cell sent a torque \
+                 message after it"
+            )
         });
     }
     Ok(())

@@ -29,19 +29,21 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
         };
         let is_active = beat.state.has(State::ACTIVE);
         let wrong = match (step.torque, is_active, before) {
-            (None, true, _) => Some("ACTIVE is set, but no torque came"),
-            (None, false, Some(true)) => Some("ACTIVE was cleared, but no torque of zeros came"),
+            (None, true, _) => Some("ACTIVE is set, but the cell sent no torque message"),
+            (None, false, Some(true)) => {
+                Some("ACTIVE was cleared, but the cell sent no torque message of zeros")
+            }
             (Some(_), false, Some(false)) => {
-                Some("a torque came, but ACTIVE was set neither before nor after it")
+                Some("the cell sent a torque message, but ACTIVE was set neither before nor after it")
             }
             (Some(torque), false, _) if !torque.is_zero() => {
-                Some("a torque that is not of zeros came, but ACTIVE is not set")
+                Some("the cell sent a torque message with nonzero words, but ACTIVE is not set")
             }
             (Some(_), ..) | (None, false, Some(false) | None) => None,
         };
         session.check("JOINTS-6", wrong.is_none(), || {
             format!(
-                "outside test mode, answers to joints must agree with ACTIVE: {}",
+                "outside test mode, answers to joints must agree with the bit ACTIVE: {}",
                 wrong.unwrap_or_default()
             )
         });

@@ -133,13 +133,16 @@ const OTHER_GROUPS_TIME_RESERVE: Span = Span::from_millis(20_000);
 
 /// The parts of requirements that cannot be tested from the bus of any cell, with the reason.
 const UNTESTABLE_REQUIREMENTS: &[(&str, &str)] = &[
-    ("CLAIM-8", "wires cannot be reached from the bus"),
-    ("TIME-3", "the order of packets of the tree"),
-    ("CONF-7", "a failing flash: the bus cannot cause it"),
-    ("CONF-8", "damaged flash: the bus cannot cause it"),
-    ("BEAT-1", "after a hang: the bus cannot cause it"),
-    ("ID-1", "uniqueness among all cells"),
-    ("CLAIM-1", "(serial mod 64) ms after the start: the bus does not show the start"),
+    ("CLAIM-8", "the wires between cells are not accessible from the bus"),
+    ("TIME-3", "the order of sums and of network pages 3 and 4"),
+    ("CONF-7", "failing flash, which the test cannot cause over the bus"),
+    ("CONF-8", "damaged flash, which the test cannot cause over the bus"),
+    ("BEAT-1", "heartbeats after a hang, which the test cannot cause over the bus"),
+    ("ID-1", "uniqueness of the serial number among all cells"),
+    (
+        "CLAIM-1",
+        "the delay of (serial number mod 64) ms after the start, because the bus does not show the start",
+    ),
 ];
 
 /// Runs the requested checks. Call [`Session::save`] before it and [`Session::restore`] after it.
@@ -226,23 +229,25 @@ fn check_precondition(session: &Session<'_>, needs: Precondition) -> Result<(), 
     let about = &session.about;
     match needs {
         Precondition::Press if !about.test_mode => {
-            Err((true, "without test mode (parameter 5) nothing can press the cell"))
+            Err((true, "the cell has no test mode (parameter 5), so the test cannot simulate a touch"))
         }
-        Precondition::Press if !about.committed => Err((true, "the cell does not take a configuration")),
-        Precondition::Restart if !session.can_restart() => Err((true, "without --restart")),
+        Precondition::Press if !about.committed => Err((true, "the cell does not accept a configuration")),
+        Precondition::Restart if !session.can_restart() => {
+            Err((true, "the test needs the option --restart COMMAND"))
+        }
         Precondition::Sensing if !about.sensing => {
-            Err((false, "it sends no sensor values without a request"))
+            Err((false, "the cell sends no sensor values without a request"))
         }
         Precondition::Sensing if !about.test_mode => {
-            Err((true, "without test mode (parameter 5) nothing can press the cell"))
+            Err((true, "the cell has no test mode (parameter 5), so the test cannot simulate a touch"))
         }
-        Precondition::Baseline if !about.baseline => Err((false, "it subtracts no zero from its readings")),
+        Precondition::Baseline if !about.baseline => {
+            Err((false, "the cell has no baseline: it subtracts no zero from its readings"))
+        }
         Precondition::Baseline if !about.test_mode || !about.committed => {
-            Err((true, "without test mode (parameter 5) and a configuration nothing can press the cell"))
+            Err((true, "the cell lacks test mode or a configuration, so the test cannot simulate a touch"))
         }
-        Precondition::Classic if session.format == Format::Fd => {
-            Err((false, "the bus is FD: there are no segments"))
-        }
+        Precondition::Classic if session.format == Format::Fd => Err((false, "a CAN FD bus has no segments")),
         Precondition::Nothing
         | Precondition::Press
         | Precondition::Restart
@@ -258,9 +263,9 @@ fn mark_tree_requirements(session: &mut Session<'_>) {
     let ids = REQUIREMENTS.iter().filter(|it| it.document == Document::Tree && it.id != "LINK-1");
     for id in ids.map(|it| it.id).chain(["CLAIM-8"]) {
         if session.about.ports {
-            session.findings.mark_not_tested(id, "wires cannot be reached from the bus");
+            session.findings.mark_not_tested(id, "the wires between cells are not accessible from the bus");
         } else {
-            session.findings.mark_not_applicable(id, "it has no ports");
+            session.findings.mark_not_applicable(id, "the cell has no ports");
         }
     }
 }

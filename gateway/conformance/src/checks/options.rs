@@ -78,11 +78,18 @@ fn check_test_mode(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.known.skin = on.then(Default::default);
         let reply = session.read_parameter(5)?;
         session.check("CONF-9", reply == Reply::Value(padded_words([on.into()])), || {
-            format!("only a write of 1 may switch test mode on, but after a write of {written} parameter 5 reads as {reply}")
+            format!(
+                "a write of 1 to parameter 5 must switch test mode on, and any other value off, but after a \
+                 write of {written} it reads as {reply}"
+            )
         });
         let state = session.exchange_messages(&[])?.state();
         session.check("CONF-9", state.has(State::TEST_MODE) == on, || {
-            format!("only a write of 1 may set TEST_MODE, but after a write of {written} to parameter 5 the state is {:04X}", state.0)
+            format!(
+                "a write of 1 to parameter 5 must set TEST_MODE, and any other value must clear it, but \
+                 after a write of {written} the state is {:04X}",
+                state.0
+            )
         });
     }
     Ok(())
@@ -104,7 +111,7 @@ fn check_reply_mode(session: &mut Session<'_>) -> Result<(), StopReason> {
     expect_reply(session, "CONF-3", REPLY_PARAMETER, [0, 5, 6, 7, 8, 9], Reply::Value([0; WORDS]))?;
     let reply = session.read_parameter(REPLY_PARAMETER)?;
     session.check("CONF-9", reply == Reply::Value([0; WORDS]), || {
-        format!("parameter 6 must read as 0 after a write of 0, but reads as {reply}")
+        format!("parameter 6 must read as 0 after a write of 0, but it reads as {reply}")
     });
     Ok(())
 }
@@ -116,12 +123,13 @@ fn check_sensing_parameters(session: &mut Session<'_>) -> Result<(), StopReason>
             let reply = session.read_parameter(number)?;
             session.check("OPT-1", reply == Reply::Value([0; WORDS]), || {
                 format!(
-                    "parameter {number} of an option that the cell lacks must read as 0, but reads as {reply}"
+                    "parameter {number} of an option that the cell lacks must read as 0, but it reads as \
+                     {reply}"
                 )
             });
             expect_refusal(session, "OPT-1", number, padded_words([1, 50]))?;
         }
-        session.findings.mark_not_applicable("SENSE-3", "it sends no sensor values without a request");
+        session.findings.mark_not_applicable("SENSE-3", "the cell sends no sensor values without a request");
         return Ok(());
     }
     for bad in [[3, 50], [-1, 50], [1, 0], [i16::MAX, 1]] {
@@ -152,7 +160,7 @@ fn check_sensing_parameters(session: &mut Session<'_>) -> Result<(), StopReason>
         expect_reply(session, "SENSE-3", EVENTS_PARAMETER, [a, b, c, d, e, 77], Reply::Value(good))?;
         let reply = session.read_parameter(EVENTS_PARAMETER)?;
         session.check("CONF-9", reply == Reply::Value(good), || {
-            format!("parameter 8 must read as it was written, but reads as {reply}")
+            format!("parameter 8 must read as it was written, but it reads as {reply}")
         });
     }
     Ok(())
@@ -205,7 +213,7 @@ fn check_impossible_row(session: &mut Session<'_>) -> Result<(), StopReason> {
     };
     let reply = session.read_parameter(number)?;
     session.check("OPT-1", reply == Reply::Value([0; WORDS]), || {
-        format!("row {} of a cell with at most {most} rows must read as 0, but reads as {reply}", most + 1)
+        format!("row {} of a cell with at most {most} rows must read as 0, but it reads as {reply}", most + 1)
     });
     expect_reply(session, "OPT-1", number, [0; WORDS], Reply::Value([0; WORDS]))?;
     expect_refusal(session, "OPT-1", number, padded_words([1, 2, 3, 4]))
@@ -225,18 +233,19 @@ pub(super) fn check_unused_bits_ignored(session: &mut Session<'_>) -> Result<(),
     session.known.halted = Some(true);
     let halted = session.exchange_frames(&frames(session, junk(Command::Halt)))?;
     session.check("OPT-2", halted.state().has(State::HALTED), || {
-        "unused words, epoch and count of a halt must be ignored, but the halt had no effect".to_owned()
+        "the cell must ignore unused words, epoch and count of a halt, but the halt had no effect".to_owned()
     });
     session.known.halted = Some(false);
     let resumed = session.exchange_frames(&frames(session, junk(Command::Resume)))?;
     session.check("OPT-2", !resumed.state().has(State::HALTED), || {
-        "unused words, epoch and count of a resume must be ignored, but the resume had no effect".to_owned()
+        "the cell must ignore unused words, epoch and count of a resume, but the resume had no effect"
+            .to_owned()
     });
     session.begin_exchange();
     let asked = session.send(&frames(session, junk(Command::Report)))?;
     let pages = session.report_pages(asked)?;
     session.check("OPT-2", !pages.is_empty(), || {
-        "unused words of a report must be ignored, but it was not answered".to_owned()
+        "the cell must ignore unused words of a report, but it did not answer the report".to_owned()
     });
     let frames_of_sync = frames(session, junk(Command::Sync));
     session.begin_exchange();
@@ -245,7 +254,7 @@ pub(super) fn check_unused_bits_ignored(session: &mut Session<'_>) -> Result<(),
         heard.iter().any(|it| it.heartbeat_and_epoch().is_some())
     })?;
     session.check("OPT-2", is_there, || {
-        "unused words of a sync must be ignored, but it was not answered".to_owned()
+        "the cell must ignore unused words of a sync, but it did not answer the sync".to_owned()
     });
     check_read_with_words(session)?;
     if session.format == Format::Fd {
@@ -259,7 +268,7 @@ pub(super) fn check_unused_bits_ignored(session: &mut Session<'_>) -> Result<(),
             heard.iter().any(|it| it.heartbeat_and_epoch().is_some())
         })?;
         session.check("OPT-2", is_there, || {
-            "a sync in a frame without bit-rate switch must be answered, but was not".to_owned()
+            "the cell must answer a sync in an FD frame without bit-rate switch, but it did not".to_owned()
         });
     }
     if session.about.test_mode && session.about.committed {
@@ -279,7 +288,8 @@ fn check_read_with_words(session: &mut Session<'_>) -> Result<(), StopReason> {
     let answer = Message::Configured { from: session.cell, tag: 3, answer };
     let is_so = exchange.answers.iter().any(|heard| heard.message == answer);
     session.check("OPT-2", is_so, || {
-        "unused words of a read must be ignored, but the answer was not the value of parameter 2".to_owned()
+        "the cell must ignore unused words of a read, but the answer was not the value of parameter 2"
+            .to_owned()
     });
     Ok(())
 }
@@ -304,7 +314,8 @@ fn check_extra_words(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.check("OPT-2", got == Some(expected), || {
         let got = got.map_or_else(|| "nothing".to_owned(), |got| arm::format_words(&got));
         format!(
-            "words after the joints of the chain must be ignored, but changed the torque from {} to {got}",
+            "the cell must ignore words after the joints of the chain, but they changed the torque from {} \
+             to {got}",
             arm::format_words(&expected)
         )
     });
@@ -316,7 +327,8 @@ fn check_extra_words(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.send(&frames)?;
     let after = session.send_next_joints(&positions)?.words();
     session.check("OPT-2", after == expected, || {
-        "unused words of a stimulus of the acceleration must be ignored, but changed the torque".to_owned()
+        "the cell must ignore unused words of an acceleration stimulus, but they changed the torque"
+            .to_owned()
     });
     session.stimulate_and_send_joints(&[0; MAX_JOINTS], arm::press_with_sum(0))?;
     Ok(())

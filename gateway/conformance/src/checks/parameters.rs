@@ -37,7 +37,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.stage_parameters(&Parameters { joints: 3, joint: 3, ..other })?;
         let step = session.stimulate_and_send_joints(&[0x0222; MAX_JOINTS], arm::press_with_sum(4_096))?;
         session.check("JOINTS-2", step.torque.is_some(), || {
-            "joints of the chain in use must be answered while a shorter chain is staged, but were not"
+            "while a shorter chain is staged, the cell must answer joints of the chain in use, but it did not"
                 .to_owned()
         });
         session.stimulate_and_send_joints(&[0x0222; MAX_JOINTS], arm::press_with_sum(0))?;
@@ -58,7 +58,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     check_torque_parameters(session, &other, &one, "CONF-7")?;
     let reply = session.read_parameter(Parameter::Commit.number())?;
     session.check("CONF-1", reply == Reply::Value([0; WORDS]), || {
-        format!("the commit parameter must read as 0, but reads as {reply}")
+        format!("the commit parameter (127) must read as 0, but it reads as {reply}")
     });
     check_unused_words_zeroed(session)?;
     check_answer_tags(session)
@@ -75,7 +75,7 @@ fn check_parameter_reads(
         let words = expected.words(parameter);
         session.check(id, reply == Reply::Value(words), || {
             format!(
-                "parameter {} reads as {reply}, but must read as {}",
+                "parameter {} reads as {reply}, but it must read as {}",
                 parameter.number(),
                 Reply::Value(words)
             )
@@ -110,7 +110,7 @@ fn check_torque_parameters(
     debug_assert!(!near(expected) || !near(not), "they are apart");
     session.check(id, near(expected), || {
         format!(
-            "the torque must follow from the parameters in use, but is {}",
+            "the torque words must follow from the parameters in use, but they are {}",
             arm::format_words(&step.words())
         )
     });
@@ -135,7 +135,7 @@ fn check_unused_words_zeroed(session: &mut Session<'_>) -> Result<(), StopReason
         let reply = session.write_parameter(parameter.number(), dirty)?;
         session.check("CONF-3", reply == Reply::Value(clean), || {
             format!(
-                "parameter {} was written with unused words, which must become 0, but the answer was {reply}",
+                "the unused words in a write of parameter {} must become 0, but the answer was {reply}",
                 parameter.number()
             )
         });
@@ -144,7 +144,10 @@ fn check_unused_words_zeroed(session: &mut Session<'_>) -> Result<(), StopReason
     let reply = session.write_parameter(Parameter::Commit.number(), [hash.cast_signed(), 1, 2, 3, 4, 5])?;
     let is_so = reply == Reply::Value(padded_words([hash.cast_signed()]));
     session.check("CONF-3", is_so, || {
-        format!("unused words must be hashed as 0, but a commit with that hash ({hash:04X}) was answered with {reply}")
+        format!(
+            "the hash must count unused words as 0, but a commit with that hash ({hash:04X}) was answered \
+             with {reply}"
+        )
     });
     if is_so {
         session.known.parameters = Some(expected);
@@ -183,7 +186,10 @@ fn check_answer_tags(session: &mut Session<'_>) -> Result<(), StopReason> {
         let replies = [session.request_with(own, 0x2A, request)?, session.request_with(own, 0x2A, request)?];
         let [first, second] = replies;
         session.check(id, first == second, || {
-            format!("the same request must get the same answer, but was answered with {second}, and with {first} before")
+            format!(
+                "the same request must get the same answer again, but the second answer was {second}, and \
+                 the first was {first}"
+            )
         });
     }
     session.known.staged =
@@ -205,14 +211,17 @@ pub(super) fn check_addressing(session: &mut Session<'_>) -> Result<(), StopReas
     let pose = all_different_parameters().words(Parameter::Pose);
     let reply = session.request(Node::Everyone, Request::Write { number, words: pose })?;
     session.check("CONF-11", reply == Reply::Value(pose), || {
-        format!("a write sent to everyone must be answered with its words, but the answer was {reply}")
+        format!(
+            "a write sent to everyone must be answered with the written words, but the answer was {reply}"
+        )
     });
     let on = [i16::from(session.about.test_mode), 0, 0, 0, 0, 0];
     let mode = Request::Write { number: Parameter::Mode.number(), words: on };
     let reply = session.request(Node::Everyone, mode)?;
     session.check("CONF-11", reply == Reply::Value(on), || {
         format!(
-            "a write of the mode sent to everyone must be answered with its words, but the answer was {reply}"
+            "a write of the mode (parameter 5) sent to everyone must be answered with the written words, but \
+             the answer was {reply}"
         )
     });
     let staged = Parameters { pose: all_different_parameters().pose, ..arm::example_parameters(2) };
@@ -222,7 +231,7 @@ pub(super) fn check_addressing(session: &mut Session<'_>) -> Result<(), StopReas
     let commit = Request::Write { number: Parameter::Commit.number(), words: hash };
     let reply = session.request(Node::Everyone, commit)?;
     session.check("CONF-11", reply == Reply::Value(hash), || {
-        format!("a commit sent to everyone must be answered with the hash, but the answer was {reply}")
+        format!("a commit sent to everyone must be answered with its hash, but the answer was {reply}")
     });
     session.known.active = None;
     let done = reply == Reply::Value(hash);
@@ -250,7 +259,10 @@ fn check_unknown_parameters(session: &mut Session<'_>) -> Result<(), StopReason>
         let replies = [session.read_parameter(number)?, session.write_first_words(number, [0])?];
         session.check("CONF-13", replies == [Reply::Refused(18); 2], || {
             let [read, write] = replies;
-            format!("parameter {number} does not exist and must be refused with reason 18, but the answers were {read} and {write}")
+            format!(
+                "parameter {number} does not exist and must be refused with reason 18, but a read was \
+                 answered with {read} and a write with {write}"
+            )
         });
     }
     Ok(())
@@ -269,7 +281,7 @@ fn check_other_cells_ignored(session: &mut Session<'_>) -> Result<(), StopReason
         let press = Message::Stimulus { to, from: protocol::message::StimulusStart::Next, page: press };
         let exchange = session.exchange_messages(&[read, press])?;
         session.check("ID-2", exchange.is_silent(), || {
-            format!("a request to cell {cell} must not be answered by this cell, but was")
+            format!("this cell must not answer a request to cell {cell}, but it did")
         });
         session.send_next_joints(&[0; MAX_JOINTS])?;
     }

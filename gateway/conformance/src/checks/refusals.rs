@@ -80,7 +80,8 @@ fn check_refused_writes(session: &mut Session<'_>, good: &Parameters) -> Result<
         let reply = session.write_first_words(parameter.number(), words)?;
         session.check("CONF-6", reply == Reply::Refused(reason), || {
             format!(
-                "parameter {} with {} must be refused with reason {reason}, but the answer was {reply}",
+                "a write of parameter {} with the words {} must be refused with reason {reason}, but the \
+                 answer was {reply}",
                 parameter.number(),
                 arm::format_words(&words)
             )

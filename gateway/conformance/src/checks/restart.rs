@@ -42,7 +42,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
             twin_heartbeat(session, lower, true),
         ),
         ("network page 2", twin_page(session, NetworkPage::Rejected(other))),
-        ("a claim with its own serial number", twin_heartbeat(session, own, true)),
+        ("a claim with the cell's own serial number", twin_heartbeat(session, own, true)),
         ("a heartbeat without CLAIMING", twin_heartbeat(session, own.wrapping_add(1), false)),
         (
             "network page 1",
@@ -68,7 +68,8 @@ fn claim(session: &Session<'_>) -> Span {
 fn restart(session: &mut Session<'_>) -> Result<Micros, StopReason> {
     let came = restart_with(session, BOOT_TIMEOUT, |_| Ok(()))?;
     came.ok_or_else(|| {
-        let what = "a heartbeat with CLAIMING must come within 8 s after a restart, but none came";
+        let what =
+            "the cell must send a heartbeat with CLAIMING within 8 s after a restart, but it sent none";
         session.check("CLAIM-1", false, || what.to_owned());
         StopReason::Restart(what.to_owned())
     })
@@ -102,7 +103,9 @@ fn restart_with(
     };
     let stray = session.answers().iter().take_while(|it| it.at < came).any(|it| !is_old(it));
     session.check("CLAIM-1", !stray, || {
-        "the first packet after a restart must be a heartbeat with CLAIMING, but another one came before it".to_owned()
+        "the first packet after a restart must be a heartbeat with CLAIMING, but the cell sent another one \
+         first"
+            .to_owned()
     });
     session.known.parameters = parameters;
     session.known.staged = None;
@@ -159,7 +162,8 @@ fn settled(session: &mut Session<'_>, claimed: Micros) -> Result<Option<Micros>,
     let expected = claim(session);
     session.check("CLAIM-5", at.is_some(), || {
         format!(
-            "a heartbeat without CLAIMING is due {} ms after the first one, but none came",
+            "{} ms after its first heartbeat, the cell must send a heartbeat without CLAIMING, but it sent \
+             none",
             expected.0 / 1_000
         )
     });
@@ -195,15 +199,16 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
     let is_new = (first.0.sent, first.0.rejected, first.1.0) == (0, 0, 0);
     session.check("CLAIM-1", is_new, || {
         format!(
-            "the first heartbeat after a restart must have 0 as sent, refused and epoch, but has {}, {} and {}",
+            "'sent', 'refused' and epoch of the first heartbeat after a restart must be 0, but they are {}, \
+             {} and {}",
             first.0.sent, first.0.rejected, first.1
         )
     });
     session.check("STATE-3", !first.0.state.has(State::HALTED), || {
-        "HALTED must be clear after a restart, but is set".to_owned()
+        "HALTED must be clear after a restart, but it is set".to_owned()
     });
     session.check("STATE-1", !first.0.state.has(State::ACTIVE), || {
-        "ACTIVE must be clear after a restart, but is set".to_owned()
+        "ACTIVE must be clear after a restart, but it is set".to_owned()
     });
     let others = session.answers().iter().filter(|it| it.at >= claimed).count();
     let at = settled(session, claimed)?;
@@ -213,24 +218,25 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
         let range = expected - expected / 100 - 2_000..=expected + expected / 100 + 22_000 + late;
         session.check("CLAIM-5", range.contains(&took), || {
             format!(
-                "claiming ended after {:.1} ms, but must end after {:.1} ms",
+                "claiming ended after {:.1} ms, but it must end after {:.1} ms",
                 took as f64 / 1e3,
                 expected as f64 / 1e3
             )
         });
     }
-    session
-        .check("CLAIM-1", others >= 1, || "a heartbeat must come after a restart, but none came".to_owned());
+    session.check("CLAIM-1", others >= 1, || {
+        "the cell must send a heartbeat after a restart, but it sent none".to_owned()
+    });
     let same = first.0.configuration == kept.hash() && first.0.state.has(State::CONFIGURED);
     session.check("CONF-8", same, || {
         format!(
-            "after a restart the configuration is {:04X}, but {:04X} was committed and must be in use",
+            "after a restart the configuration is {:04X}, but it must be the committed configuration {:04X}",
             first.0.configuration,
             kept.hash()
         )
     });
     session.check("ID-3", at.is_some(), || {
-        "after a restart the cell must send under its node id, but did not".to_owned()
+        "after a restart the cell must keep its node id, but it did not settle on that node id".to_owned()
     });
     session.known.hash = Some(kept.hash());
     (session.known.halted, session.known.epoch) = (Some(false), Some(0));
@@ -239,7 +245,7 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
         let reply = session.read_parameter(parameter.number())?;
         session.check("CONF-8", reply == Reply::Value(kept.words(parameter)), || {
             format!(
-                "after a restart parameter {} must read as it was committed, but reads as {reply}",
+                "after a restart parameter {} must read as it was committed, but it reads as {reply}",
                 parameter.number()
             )
         });
@@ -248,7 +254,10 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
     let hash = staged.hash().cast_signed();
     let reply = session.write_first_words(Parameter::Commit.number(), [hash])?;
     session.check("CONF-2", reply == Reply::Refused(16), || {
-        format!("a restart must discard staged values and their commit be refused with reason 16, but it was answered with {reply}")
+        format!(
+            "a restart must discard staged values, so their commit must be refused with reason 16, but the \
+             answer was {reply}"
+        )
     });
     volatile(session)?;
     (session.known.parameters, session.known.staged) = (Some(kept), Some(kept));
@@ -258,7 +267,8 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
     let done = session.commit_parameters(&next)?;
     session.switch_test_mode(session.about.test_mode)?;
     session.check("CONF-2", done, || {
-        "after a restart the staged copy must equal the values in use, but a commit on top of it failed"
+        "after a restart the staged copy must equal the values in use, but a commit that changes one value \
+         failed"
             .to_owned()
     });
     let after = if session.known.test_mode == Some(true) { touched(session)? } else { None };
@@ -266,14 +276,14 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
         let words =
             |words: Option<Words>| words.map_or_else(String::new, |it| arm::format_words(it.as_slice()));
         format!(
-            "the same press must give the same torque, but gave {} before a restart, and {} after it",
+            "the same touch must give the same torque words, but it gave {} before a restart and {} after it",
             words(before),
             words(after)
         )
     });
     let counters = session.counters()?;
     session.check("BEAT-4", counters.refused == protocol::message::RejectedCounts::default(), || {
-        format!("counters must begin with 0 after a restart, but are {counters}")
+        format!("counters must start at 0 after a restart, but they are {counters}")
     });
     Ok(first.0.state.has(State::TEST_MODE))
 }
@@ -284,7 +294,10 @@ fn volatile(session: &mut Session<'_>) -> Result<(), StopReason> {
     for (number, expected) in [(6, [0; WORDS]), (7, [0; WORDS]), (8, events), (9, [0; WORDS])] {
         let reply = session.read_parameter(number)?;
         session.check("CONF-9", reply == Reply::Value(expected), || {
-            format!("after a restart parameter {number} is {reply}, but must be {}", Reply::Value(expected))
+            format!(
+                "after a restart parameter {number} is {reply}, but it must be {}",
+                Reply::Value(expected)
+            )
         });
     }
     // A simulated cell may be started with test mode on.
@@ -339,7 +352,8 @@ fn in_the_middle(session: &mut Session<'_>) -> Result<(), StopReason> {
     let is_noticed = !beat.state.has(State::CONFIGURED) && beat.state.has(State::FLASH_DAMAGED);
     session.check("CONF-8", is_whole || is_noticed, || {
         format!(
-            "after a reset during a commit the old or the new configuration must be in use, or FLASH_DAMAGED be set, but the configuration is {:04X}, and the state {:04X}",
+            "after a reset during a commit, the old or the new configuration must be in use or FLASH_DAMAGED \
+             must be set, but the configuration is {:04X} and the state is {:04X}",
             beat.configuration, beat.state.0
         )
     });

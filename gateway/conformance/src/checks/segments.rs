@@ -76,7 +76,9 @@ fn check_three_segments(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.mark_packets_expected();
     let came = session.answers().iter().any(|it| it.torque().is_some());
     session.check("COUNT-3", !came, || {
-        "joints of three segments 9 ms apart must not be answered, because the first is too old for the last, but were".to_owned()
+        "the cell must not answer joints of three segments 9 ms apart, because the first is too old when the \
+         last arrives, but it did"
+            .to_owned()
     });
     session.send_next_joints(&[0x0111; MAX_JOINTS])?;
     session.forget_counters();
@@ -101,7 +103,7 @@ fn segment_series(session: &Session<'_>) -> Vec<SegmentSeries> {
     let of =
         |what, acts: Vec<SeriesStep>, packets, incomplete| SegmentSeries { what, acts, packets, incomplete };
     vec![
-        of("two segments", vec![Send(a1), Send(a2)], 1, 0),
+        of("the two segments of a packet", vec![Send(a1), Send(a2)], 1, 0),
         of(
             "segments in the wrong order, then the second one again",
             vec![Send(a2), Send(a1), Send(a2)],
@@ -119,7 +121,7 @@ fn segment_series(session: &Session<'_>) -> Vec<SegmentSeries> {
         ),
         of("a wrong CRC, then a packet", vec![Send(a1), Send(bad), Send(b1), Send(b2)], 1, 1),
         of(
-            "segments of several identifiers between each other",
+            "interleaved segments of several identifiers",
             vec![Send(a1), Send(s1), Send(e1), Send(a2), Send(e2), Send(s2)],
             2,
             0,
@@ -132,7 +134,7 @@ fn segment_series(session: &Session<'_>) -> Vec<SegmentSeries> {
             1,
         ),
         of(
-            "a lost segment, and the next one long after it",
+            "a lost segment, then another packet 150 ms later",
             vec![Send(a1), Wait(150), Send(b1), Send(b2)],
             1,
             1,
@@ -185,13 +187,14 @@ fn run_series(session: &mut Session<'_>, series: &SegmentSeries) -> Result<(), S
             after.length == before.length && after.meaning == before.meaning && after.crc == before.crc;
         session.check("COUNT-3", (answers, counted) == expected && others, || {
             format!(
-                "{}: {answers} packets were answered and {counted} counted as incomplete, but {} and {} were expected",
+                "{}: the cell answered {answers} packets and counted {counted} as incomplete, but {} and {} \
+                 were expected",
                 series.what, series.packets, series.incomplete
             )
         });
         return Ok(());
     }
-    session.findings.mark_not_tested("COUNT-3", "the bench was late each time");
+    session.findings.mark_not_tested("COUNT-3", "this computer was late in every attempt");
     Ok(())
 }
 
@@ -210,7 +213,7 @@ fn check_seven_segments(session: &mut Session<'_>) -> Result<(), StopReason> {
     run_series(
         session,
         &SegmentSeries {
-            what: "seven segments of which no two form a packet, and a packet",
+            what: "seven segments that form no packet, then a packet",
             acts,
             packets: 1,
             incomplete: 4,
@@ -244,7 +247,8 @@ fn check_interleaved_frame(
         exchange.answers.len() == 1 && is_counted && after.refused.incomplete == before.refused.incomplete;
     session.check("COUNT-3", is_so, || {
         format!(
-            "{what} between two segments must not disturb the read: one answer must come, but {} came; the counters are {after}; before: {before}",
+            "{what} between two segments must not disturb the read: the cell must send one answer, but it \
+             sent {}; the counters are {after}; before: {before}",
             exchange.answers.len()
         )
     });
@@ -283,7 +287,8 @@ fn check_joints_segments(session: &mut Session<'_>) -> Result<(), StopReason> {
             let is_so = came == arrives && counted == u16::from(!arrives) && step.torque.is_some();
             session.check("COUNT-3", is_so, || {
                 format!(
-                    "a cell must wait 15 ms for the next segment of joints, but segments {} us apart were {}answered, and {counted} were counted as incomplete",
+                    "a cell must wait 15 ms for the next segment of joints, but segments {} us apart were \
+                     {}answered, and {counted} packets were counted as incomplete",
                     apart.0,
                     if came { "" } else { "not " }
                 )

@@ -77,7 +77,7 @@ fn check_sensing_switch(
     let pages = sensor_page_numbers(session.answers());
     session.check("SENSE-4", pages == expected, || {
         format!(
-            "after {what}, sensors pages {} came, but {} were expected",
+            "after {what}, the sensors pages sent were {}, but {} were expected",
             format_pages(&pages),
             format_pages(expected)
         )
@@ -90,11 +90,11 @@ fn check_sensing_switches(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.write_first_words(SENSING_PARAMETER, [0])?;
     session.wait_for_late_packets()?;
     check_sensing_switch(session, [2, 0], &[0, 1], "a switch to event mode")?;
-    check_sensing_switch(session, [2, 0], &[], "the same mode again")?;
+    check_sensing_switch(session, [2, 0], &[], "a write of the same mode")?;
     check_sensing_switch(session, [1, 1_000], &[0, 1], "a switch to continuous mode")?;
-    check_sensing_switch(session, [1, 1_000], &[], "the same period again")?;
-    check_sensing_switch(session, [1, 1_001], &[0, 1], "another period")?;
-    check_sensing_switch(session, [0, 0], &[], "a switch off")?;
+    check_sensing_switch(session, [1, 1_000], &[], "a write of the same period")?;
+    check_sensing_switch(session, [1, 1_001], &[0, 1], "a change of the period")?;
+    check_sensing_switch(session, [0, 0], &[], "a switch to off")?;
     check_sensing_switch(session, [2, 0], &[0, 1], "a switch to event mode")
 }
 
@@ -107,7 +107,10 @@ fn check_torque_before_page(session: &mut Session<'_>) -> Result<(), StopReason>
         let kinds: Vec<_> = step.exchange.answers.iter().map(|it| it.message.id().kind.name()).collect();
         session.check("TIME-3", kinds == ["torque", "sensors"], || {
             let kinds = kinds.join(", ");
-            format!("in event mode, the start and the end of a touch must each give a torque and then a sensors page, but {kinds} came")
+            format!(
+                "in event mode, the cell must send a torque message and then a sensors page when a touch \
+                 starts or ends, but it sent: {kinds}"
+            )
         });
     }
     Ok(())
@@ -165,7 +168,8 @@ fn check_events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<
                 let moved = acceleration
                     .map_or_else(String::new, |it| arm::format_page(SensorPage::Acceleration(it)));
                 format!(
-                    "{} {moved} is latched at step {} (before: {turned}): pages {} came, but {} were expected",
+                    "after {} {moved} was latched at step {} (state before: {turned}), the sensors pages \
+                     sent were {}, but {} were expected",
                     arm::format_skin(Some(skin)),
                     step + 1,
                     format_pages(&numbers),
@@ -180,7 +184,7 @@ fn check_events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<
         session.check("SENSE-7", is_latched, || {
             let sent: Vec<_> = sent.iter().map(|page| arm::format_page(*page)).collect();
             format!(
-                "sensors pages must have the latched values, but {} was sent and is not latched",
+                "sensors pages must contain the latched values, but the cell sent {}, which is not latched",
                 sent.join("; ")
             )
         });
@@ -280,13 +284,17 @@ fn check_pages_after_beats(session: &mut Session<'_>) -> Result<(), StopReason> 
     session.check("SENSE-10", is_so, || {
         let all: Vec<_> = beats.iter().map(|pages| format_pages(pages)).collect();
         let count = beats.len();
-        format!("in event mode page 0 must follow each heartbeat, and every page each fourth one, but these came after {count} heartbeats: {}", all.join(", "))
+        format!(
+            "in event mode, sensors page 0 must follow each heartbeat and all pages every fourth one, but \
+             these pages followed {count} heartbeats: {}",
+            all.join(", ")
+        )
     });
     // Other heartbeats are not followed by pages.
     session.wait_for_heartbeat_gap(Span::from_millis(60))?;
     let sync = session.exchange_messages(&[])?;
     session.check("SENSE-10", sync.is_silent(), || {
-        "no page must follow the heartbeat to a sync, but one came".to_owned()
+        "no sensors page may follow the heartbeat that answers a sync, but the cell sent one".to_owned()
     });
     Ok(())
 }
@@ -303,7 +311,8 @@ fn check_events_while_halted(session: &mut Session<'_>) -> Result<(), StopReason
         session.check("SENSE-11", pages == [0], || {
             let pages = format_pages(&pages);
             format!(
-                "a halted cell in event mode must send page 0 when a touch starts or ends, but sent {pages}"
+                "a halted cell in event mode must send sensors page 0 when a touch starts or ends, but it \
+                 sent {pages}"
             )
         });
     }
@@ -370,9 +379,9 @@ fn check_page_times(session: &mut Session<'_>, period: u64, with_joints: bool) -
             session.check(id, is_so, || {
                 let times = format_ms(times.iter().copied());
                 format!(
-                    "with a period of {period} ms{}: page 0 came {times} ms after the switch, but must come after {} ms and then \
-                     every {period} ms",
-                    if with_joints { ", joints every 16 ms" } else { "" },
+                    "with a period of {period} ms{}, the cell sent sensors page 0 {times} ms after the \
+                     switch, but it must send it after {} ms and then every {period} ms",
+                    if with_joints { " and joints every 16 ms" } else { "" },
                     first / 1_000
                 )
             });

@@ -40,11 +40,11 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     let after = session.counters()?;
     let counted = after.heard.stimuli.wrapping_sub(before.heard.stimuli);
     session.check("STIM-3", counted == count, || {
-        format!("{count} stimuli were sent, but {counted} were counted")
+        format!("{count} stimuli were sent, but the cell counted {counted}")
     });
     let counted = after.heard.stimuli_late.wrapping_sub(before.heard.stimuli_late);
     session.check("STIM-5", counted == late, || {
-        format!("{late} stimuli were sent too late, but {counted} were counted as late")
+        format!("{late} stimuli were sent too late, but the cell counted {counted} as late")
     });
     let is_same = after.refused == before.refused;
     session.check("STIM-6", is_same, || {
@@ -72,7 +72,7 @@ fn check_press_latched(
     let is_there = step.torque.is_some_and(|words| !words.is_zero());
     session.check(id, is_there == (sum > 0), || {
         format!(
-            "the joints of epoch {epoch} must latch {} N, but the torque is {}",
+            "joints of epoch {epoch} must latch a force of {} N, but the torque words are {}",
             f64::from(sum) / 1024.0,
             arm::format_words(&step.words())
         )
@@ -220,7 +220,7 @@ fn check_pending_limit(session: &mut Session<'_>, cell: &PressedCell) -> Result<
     );
     session.check("STIM-6", counted == (8, 2), || {
         format!(
-            "of 10 stimuli 8 must be accepted and 2 refused, but {} were accepted and {} refused",
+            "the cell must accept 8 of 10 stimuli and refuse 2, but it accepted {} and refused {}",
             counted.0, counted.1
         )
     });
@@ -262,14 +262,17 @@ fn check_measuring_refuses_stimuli(session: &mut Session<'_>) -> Result<(), Stop
     let after = session.counters()?;
     let counted = after.refused.stimuli.wrapping_sub(before.refused.stimuli);
     session.check("STIM-1", counted == 2 && after.heard.stimuli == before.heard.stimuli, || {
-        format!("outside test mode 2 stimuli must be counted as refused, but {counted} were: {after}")
+        format!(
+            "outside test mode, the cell must count 2 stimuli as refused, but it counted {counted}; the \
+             counters are {after}"
+        )
     });
     session.switch_test_mode(true)?;
     session.known.active = None;
     session.send_next_joints(&POSITIONS)?;
     let step = session.send_next_joints(&POSITIONS)?;
     session.check("STIM-1", step.torque.is_none(), || {
-        "a stimulus sent outside test mode must not be latched, but a torque came".to_owned()
+        "a stimulus sent outside test mode must not be latched, but the cell sent a torque message".to_owned()
     });
     Ok(())
 }

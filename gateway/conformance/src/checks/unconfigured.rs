@@ -24,7 +24,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
         let latched = session.read_latched_skin()?;
         session.check("JOINTS-3", latched == Some(skin), || {
             format!(
-                "a cell without a configuration latched {}, but must latch {}",
+                "a cell without a configuration latched {}, but it must latch {}",
                 arm::format_skin(latched),
                 arm::format_skin(Some(skin))
             )
@@ -44,7 +44,7 @@ fn check_staged_reads(session: &mut Session<'_>) -> Result<(), StopReason> {
     let reply = session.read_parameter(number)?;
     session.check("CONF-1", reply == Reply::Value(pose), || {
         format!(
-            "without a configuration, parameter {number} must read as the staged {}, but reads as {reply}",
+            "without a configuration, parameter {number} must read as the staged {}, but it reads as {reply}",
             Reply::Value(pose)
         )
     });
@@ -68,24 +68,31 @@ fn check_joints_unanswered(session: &mut Session<'_>) -> Result<(), StopReason> 
         session.known.epoch = Some(epoch);
         let exchange = session.exchange_messages(&[joints])?;
         session.check("JOINTS-5", exchange.is_silent(), || {
-            format!("a cell without a configuration must not answer joints, but answered those of a chain of {count} joints")
+            format!(
+                "a cell without a configuration must not answer joints, but it answered those of a chain of \
+                 {count} joints"
+            )
         });
         session.exchange_messages(&[joints])?;
     }
     let after = session.counters()?;
     let skipped = after.heard.joints_late.wrapping_sub(before.heard.joints_late);
     session.check("JOINTS-4", skipped == 0, || {
-        format!("a cell without a configuration must not skip joints, but skipped {skipped}")
+        format!("a cell without a configuration must not skip joints, but it skipped {skipped}")
     });
     let counted = after.heard.joints.wrapping_sub(before.heard.joints);
     session.check("JOINTS-2", counted == u16::from(most), || {
         format!(
-            "a cell without a configuration must count joints of chain lengths 1 to {most}, but counted {counted}"
+            "a cell without a configuration must count joints messages of chains with 1 to {most} joints, \
+             but it counted {counted} messages"
         )
     });
     let repeated = after.heard.joints_repeated.wrapping_sub(before.heard.joints_repeated);
     session.check("JOINTS-3", repeated == u16::from(most), || {
-        format!("{most} joints messages were sent twice to a cell without a configuration, but {repeated} were counted as repeated")
+        format!(
+            "{most} joints messages were sent twice to a cell without a configuration, but it counted \
+             {repeated} as repeated"
+        )
     });
     let wrong = [
         (7, Length::Six),
@@ -107,7 +114,8 @@ fn check_joints_unanswered(session: &mut Session<'_>) -> Result<(), StopReason> 
     let expected = can.count();
     session.check("COUNT-1", usize::from(counted) == expected, || {
         format!(
-            "{expected} joints messages whose count does not match their length must be counted in the counter meaning, but {counted} were"
+            "{expected} joints messages whose count does not match their length must be counted in the \
+             counter 'meaning', but {counted} were"
         )
     });
     session.exchange_messages(&[Message::Resume])?;

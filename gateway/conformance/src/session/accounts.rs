@@ -146,34 +146,45 @@ impl PacketAccounts {
         let all = [
             (
                 "JOINTS-5",
-                "joints and joints_skipped",
-                "joints",
+                "counters 'joints' and 'joints_skipped' together",
+                "joints messages sent",
                 joints.wrapping_add(skipped),
                 now.taken,
                 before.taken,
             ),
             (
                 "JOINTS-1",
-                "joints_repeated",
-                "joints of the epoch of the last ones",
+                "counter 'joints_repeated'",
+                "joints messages sent with the epoch of the last one",
                 since(|it| it.joints_repeated),
                 now.repeated,
                 before.repeated,
             ),
             (
                 "STIM-6",
-                "stimuli, taken and refused,",
-                "stimuli",
+                "counters of accepted and refused stimuli together",
+                "stimuli sent",
                 taken.wrapping_add(repeated),
                 now.stimuli,
                 before.stimuli,
             ),
-            ("JOINTS-6", "torques", "torques that came", since(|it| it.torques), now.torques, before.torques),
+            (
+                "JOINTS-6",
+                "counter 'torques'",
+                "torque messages received",
+                since(|it| it.torques),
+                now.torques,
+                before.torques,
+            ),
         ];
         let differs = |(id, name, what, counted, now, before): (_, _, _, u16, u16, u16)| {
             let expected = now.wrapping_sub(before);
-            let text =
-                || format!("{name} must go up by {expected}, the number of {what}, but went up by {counted}");
+            let text = || {
+                format!(
+                    "the {name} must increase by {expected}, the number of {what}, but the increase is \
+                     {counted}"
+                )
+            };
             (counted != expected).then(|| (id, text()))
         };
         all.into_iter().filter_map(differs).collect()

@@ -19,12 +19,17 @@ impl Session<'_> {
         let came =
             self.wait_for_packets(until, |heard| heard.iter().any(|it| it.heartbeat_and_epoch().is_some()))?;
         let at = self.answers().iter().find(|it| it.heartbeat_and_epoch().is_some()).map(|it| it.at);
-        self.check("BEAT-1", came, || "a heartbeat is due every 250 ms, but none came for 300 ms".to_owned());
+        self.check("BEAT-1", came, || {
+            "the cell must send a heartbeat every 250 ms, but it sent none for 300 ms".to_owned()
+        });
         self.life.regular = at;
         if let Some((came, min, max)) = at.and_then(|at| self.life.accounts.note_regular_heartbeat(at)) {
             self.check("BEAT-1", (min..=max).contains(&came), || {
                 let due = if min == max { min.to_string() } else { format!("{min} to {max}") };
-                format!("{came} heartbeats came, but {due} were due: one every 250 ms, and one to each sync and claim")
+                format!(
+                    "the cell sent {came} heartbeats, but {due} were due: one every 250 ms, and one for each \
+                     sync and claim"
+                )
             });
         }
         self.receive_for(HEARTBEAT_QUIET_MARGIN)?;
@@ -40,7 +45,7 @@ impl Session<'_> {
             self.begin_expected_exchange();
             self.check("BEAT-1", surplus == 0, || {
                 let many = if surplus > 0 { "too many" } else { "too few" };
-                format!("{} heartbeats {many} came over the whole test", surplus.abs())
+                format!("the cell sent {} heartbeats {many} over the whole test", surplus.abs())
             });
         }
     }

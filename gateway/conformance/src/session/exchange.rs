@@ -53,7 +53,7 @@ impl Session<'_> {
         let is_answer = |heard: &CellPacket| heard.heartbeat_and_epoch().is_some() && heard.at >= sync;
         let answered = self.wait_for_answer(sync)?;
         self.check("CMD-3", answered, || {
-            "a sync must be answered with a heartbeat, but none came".to_owned()
+            "the cell must answer a sync with a heartbeat, but it sent none".to_owned()
         });
         let beats =
             |it: &Self| it.answers().iter().filter(|heard| heard.heartbeat_and_epoch().is_some()).count();
@@ -75,7 +75,8 @@ impl Session<'_> {
             }
             let is_after = after(self);
             self.check("CMD-3", is_after, || {
-                "the heartbeat to a sync must follow the torque, but came before it".to_owned()
+                "the heartbeat that answers a sync must follow the torque message, but the cell sent it first"
+                    .to_owned()
             });
         }
         let beat = self

@@ -149,13 +149,16 @@ impl Session<'_> {
             exchange.answers.iter().filter(|heard| heard.torque().is_some()).copied().collect();
         let count = torques.len();
         self.check("JOINTS-6", count <= 1, || {
-            format!("joints of epoch {epoch} must be answered with at most one torque, but {count} came")
+            format!(
+                "the cell must answer joints of epoch {epoch} with at most one torque message, but it sent \
+                 {count}"
+            )
         });
         for other in exchange.answers.iter().filter(|heard| heard.torque().is_none()) {
             if let Some(id) = self.known.violated_requirement(&other.message) {
                 let kind = other.message.id().kind.name();
                 self.check(id, false, || {
-                    format!("joints must not be answered with a {kind} packet, but one came")
+                    format!("the cell must not answer joints with a {kind} packet, but it sent one")
                 });
             }
         }
@@ -173,12 +176,16 @@ impl Session<'_> {
             let id = if halted { "CMD-1" } else { "JOINTS-6" };
             self.check(id, first.is_some() == expected, || {
                 let what = match due {
-                    Some(ExpectedAnswer::Torque) => "in contact: a torque was due, but none came",
-                    Some(ExpectedAnswer::Zeros) => "released: one torque of zeros was due, but none came",
-                    _ if halted => "halted: no torque was due, but one came",
-                    _ => "not in contact: nothing was due, but a torque came",
+                    Some(ExpectedAnswer::Torque) => {
+                        "the cell is in contact and must answer with a torque message, but it sent none"
+                    }
+                    Some(ExpectedAnswer::Zeros) => {
+                        "the touch has ended and a torque message of zeros was due, but the cell sent none"
+                    }
+                    _ if halted => "the cell is halted and must not send a torque message, but it sent one",
+                    _ => "the cell is not in contact and must not answer, but it sent a torque message",
                 };
-                format!("joints of epoch {epoch}, {what}")
+                format!("joints of epoch {epoch}: {what}")
             });
         }
         if let Some((at, of, words)) = first {
@@ -191,11 +198,15 @@ impl Session<'_> {
                 self.record_answer_time("torque", exchange.at, at);
             }
             self.check("JOINTS-6", of.0 == epoch, || {
-                format!("the torque that answers epoch {epoch} must have that epoch, but has {of}")
+                format!(
+                    "the torque message that answers joints of epoch {epoch} must have this epoch, but it \
+                     has {of}"
+                )
             });
             if due == Some(ExpectedAnswer::Zeros) {
                 self.check("JOINTS-6", words.is_zero(), || {
-                    "after a release the torque must be of zeros, but is not".to_owned()
+                    "after a touch has ended, all words of the torque message must be 0, but they are not"
+                        .to_owned()
                 });
             }
             self.check_torque_shape(&words);
@@ -218,12 +229,16 @@ impl Session<'_> {
         let Some(parameters) = self.known.parameters else { return };
         let length = Length::for_joints(parameters.joints.into());
         self.check("SEND-1", words.length() == length, || {
-            format!("a torque has {} words, but must have {}", words.length().words(), length.words())
+            format!(
+                "a torque message has {} words, but it must have {}",
+                words.length().words(),
+                length.words()
+            )
         });
         let beyond = words.padded().iter().skip(parameters.joint.into()).all(|word| *word == 0);
         self.check("J-1", beyond, || {
             format!(
-                "torque words beyond joint {} must be 0, but the torque is {}",
+                "torque words beyond joint {} must be 0, but the words are {}",
                 parameters.joint,
                 arm::format_words(words.as_slice())
             )
@@ -244,11 +259,14 @@ impl Session<'_> {
             let stays = *first && !expected && self.life.saturated;
             self.check(if stays { "STATE-2" } else { "TORQUE-2" }, *first == expected, || {
                 let (set, words) = (if *first { "" } else { "not " }, arm::format_words(words.as_slice()));
-                format!("SATURATED must be set exactly after torques at a limit of their range, but is {set}set after {words}")
+                format!(
+                    "SATURATED must be set after torque words at a limit of their range, and only then, but \
+                     it is {set}set after {words}"
+                )
             });
             let again = expected && rest.contains(&true);
             self.check("STATE-2", !again, || {
-                "SATURATED must be set in one heartbeat only, but is set in two".to_owned()
+                "SATURATED must be set in one heartbeat only, but it is set in two".to_owned()
             });
             self.life.saturated = expected;
         }

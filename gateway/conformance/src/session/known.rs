@@ -98,7 +98,7 @@ impl Session<'_> {
                 let is_set = state.has(bit);
                 self.check(id, is_set == expected, || {
                     format!(
-                        "{name} is {}set in state {:04X}, but the opposite was expected",
+                        "the bit {name} is {}set in state {:04X}, but the opposite was expected",
                         if is_set { "" } else { "not " },
                         state.0
                     )
@@ -117,13 +117,17 @@ impl Session<'_> {
         }
         if let Some(hash) = known.hash {
             self.check("STATE-3", beat.configuration == hash, || {
-                format!("a heartbeat has configuration {:04X}, but must have {hash:04X}", beat.configuration)
+                format!(
+                    "a heartbeat reports configuration {:04X}, but it must report {hash:04X}",
+                    beat.configuration
+                )
             });
         }
         if let Some(expected) = known.epoch {
             self.check("JOINTS-3", epoch.0 == expected, || {
                 format!(
-                    "a heartbeat must have the epoch of the last accepted joints, {expected}, but has {epoch}"
+                    "a heartbeat must have the epoch of the last accepted joints, {expected}, but it has \
+                     {epoch}"
                 )
             });
         }

@@ -62,7 +62,7 @@ impl Session<'_> {
                 }
                 self.check("SEND-1", false, || {
                     format!(
-                        "{frame} is not a packet: no other segment came within {} ms",
+                        "frame {frame} is only a part of a packet: no other segment arrived within {} ms",
                         ANSWER_TIMEOUT.0 / 1_000
                     )
                 });
@@ -75,7 +75,10 @@ impl Session<'_> {
         let frame = &seen.frame;
         if frame.format() != self.format {
             self.check("SEND-1", false, || {
-                format!("the cell must not send {} frames on this bus, but sent one", frame.format().name())
+                format!(
+                    "the cell must not send {} frames on this bus, but it sent one",
+                    frame.format().name()
+                )
             });
             return;
         }
@@ -83,7 +86,7 @@ impl Session<'_> {
             Format::Fd => {
                 let switches = frame.flags() & BIT_RATE_SWITCH != 0;
                 self.check("SEND-1", switches, || {
-                    format!("an FD frame must have the bit-rate switch, but {frame} does not")
+                    format!("an FD frame must have the bit-rate switch (BRS), but {frame} does not have it")
                 });
                 Packet::from_fd(frame)
             }
@@ -119,7 +122,7 @@ impl Session<'_> {
                 self.check_packet(&heard);
             }
             Err(error) => {
-                self.check("SEND-1", false, || format!("{frame} is not a packet: {error}"));
+                self.check("SEND-1", false, || format!("frame {frame} is not a valid packet: {error}"));
             }
         }
     }
@@ -137,17 +140,20 @@ impl Session<'_> {
             if let Some((last, packets)) = self.life.sent {
                 let expected = last.wrapping_add(packets);
                 self.check("BEAT-4", sent == expected, || {
-                    format!("the counter sent in a heartbeat must be {expected}, going by the packets that came, but is {sent}")
+                    format!(
+                        "the counter 'sent' in a heartbeat must be {expected}, the number of packets \
+                         received, but it is {sent}"
+                    )
                 });
             }
             self.life.sent = Some((sent, 0));
             let version = state.version();
             self.check("STATE-3", version == 1, || {
-                format!("a heartbeat must have version 1, but has {version}")
+                format!("a heartbeat must have protocol version 1, but it has {version}")
             });
             if let Some(expected) = self.about.serial {
                 self.check("ID-1", serial == expected, || {
-                    format!("the serial number must stay {expected}, but is {serial} in a heartbeat")
+                    format!("the serial number must stay {expected}, but it is {serial} in a heartbeat")
                 });
             }
         }

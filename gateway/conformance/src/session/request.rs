@@ -89,7 +89,7 @@ impl core::fmt::Display for Reply {
                 }
                 Ok(())
             }
-            Self::Refused(reason) => write!(f, "a refusal with {reason}"),
+            Self::Refused(reason) => write!(f, "a refusal with reason {reason}"),
             Self::Nothing => f.write_str("nothing"),
         }
     }
@@ -162,7 +162,7 @@ impl Session<'_> {
         let Some((answered, came, answer)) = found else {
             self.check(id, false, || {
                 format!(
-                    "a request for parameter {number} must be answered within {} ms, but was not",
+                    "the cell must answer a request for parameter {number} within {} ms, but it did not",
                     longest.0 / 1_000
                 )
             });
@@ -170,16 +170,17 @@ impl Session<'_> {
         };
         self.record_answer_time(if is_commit { "commit" } else { "configured" }, at, answered);
         self.check("CONF-12", came == tag, || {
-            format!("the answer must have the request's tag {tag:02X}, but has {came:02X}")
+            format!("the answer must have the tag of the request, {tag:02X}, but it has {came:02X}")
         });
         let reply = match answer {
             Answer::Value { number: got, written, words } => {
                 self.check(id, got == number, || {
-                    format!("the answer must name parameter {number}, but names {got}")
+                    format!("the answer must name parameter {number}, but it names {got}")
                 });
                 self.check(id, written == is_write, || {
                     format!(
-                        "bit 0x80 must be set only in the answer to a write, but is {}set",
+                        "bit 0x80 must be set in the answer to a write and clear in the answer to a read, \
+                         but it is {}set",
                         if written { "" } else { "not " }
                     )
                 });
@@ -187,7 +188,7 @@ impl Session<'_> {
             }
             Answer::Refused { number: got, reason } => {
                 self.check("CONF-6", got == number, || {
-                    format!("the refusal must name parameter {number}, but names {got}")
+                    format!("the refusal must name parameter {number}, but it names {got}")
                 });
                 Reply::Refused(reason)
             }
@@ -207,7 +208,8 @@ impl Session<'_> {
                 let reply = self.write_parameter(parameter.number(), words)?;
                 self.check("CONF-4", reply == Reply::Value(words), || {
                     format!(
-                        "a write of parameter {} must be answered with its words, but the answer was {reply}",
+                        "a write of parameter {} must be answered with the written words, but the answer was \
+                         {reply}",
                         parameter.number()
                     )
                 });
@@ -283,7 +285,7 @@ impl Session<'_> {
             let names: Vec<_> = pages.iter().map(|it| page_name(&it.message)).collect();
             self.check("CMD-4", names == order, || {
                 format!(
-                    "a report was answered with {}, but must be answered with {}",
+                    "the cell answered a report with {}, but it must answer with {}",
                     names.join(", "),
                     order.join(", ")
                 )
@@ -307,7 +309,7 @@ impl Session<'_> {
         }
         let whole = heard.zip(refused);
         self.check("CMD-4", whole.is_some(), || {
-            "a report must be answered with network pages 1 and 2, but they did not both come".to_owned()
+            "the cell must answer a report with network pages 1 and 2, but it did not send both".to_owned()
         });
         if let Some((heard, refused)) = whole {
             for (id, what) in self.life.accounts.compare_counters(heard, refused) {
@@ -320,7 +322,11 @@ impl Session<'_> {
             let sum =
                 [length, crc, foreign, meaning, incomplete, stimuli].into_iter().fold(0, u16::wrapping_add);
             self.check("BEAT-4", beat.rejected == sum, || {
-                format!("the counter refused in a heartbeat is {}, but must be {sum}, the sum of the counters of network page 2", beat.rejected)
+                format!(
+                    "the counter 'refused' in a heartbeat is {}, but it must be {sum}, the sum of the \
+                     counters of network page 2",
+                    beat.rejected
+                )
             });
         }
         let (heard, refused) = whole.unwrap_or_default();

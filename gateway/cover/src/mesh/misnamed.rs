@@ -6,7 +6,7 @@ use roxmltree::Document;
 use super::MeshError;
 
 /// The advice for a file of an unsupported format.
-const CONVERT_ADVICE: &str = "convert it to stl, dae or obj, and name that in the URDF";
+const CONVERT_ADVICE: &str = "convert it to stl, dae or obj, and name the converted file in the URDF";
 
 /// The first bytes, the name of the format, and the advice for each known format.
 const FORMAT_SIGNATURES: &[(&[u8], &str, &str)] = &[
@@ -54,7 +54,7 @@ fn detect_xml_format(extension: &str, bytes: &[u8]) -> Option<(String, &'static 
     match (name, extension) {
         ("COLLADA", "dae") => None,
         ("COLLADA", _) => Some((what, "rename it to .dae, in the URDF too")),
-        _ => Some((what, "name the mesh itself")),
+        _ => Some((what, "name the file of the mesh")),
     }
 }
 
@@ -92,7 +92,7 @@ mod tests {
                 let error = refused(&format!("a.{extension}"), &[bytes, &[0; 100]].concat());
                 assert!(
                     error.ends_with(&format!(
-                        "{what}: convert it to stl, dae or obj, and name that in the URDF"
+                        "{what}: convert it to stl, dae or obj, and name the converted file in the URDF"
                     )),
                     "{error}"
                 );
@@ -105,7 +105,7 @@ mod tests {
         let latin = refused("a.dae", b"<COLLADA>\xfc</COLLADA>");
         assert!(latin.ends_with("(if it is in Latin-1)"), "{latin}");
         let typed = refused("a.dae", b"<!DOCTYPE a [<!ENTITY a 'b'>]><COLLADA/>");
-        assert!(typed.ends_with("write what its entities stand for in their places"), "{typed}");
-        assert!(refused("a", STL.as_bytes()).ends_with("; add the one that it is"));
+        assert!(typed.ends_with("and replace its entities by their values"), "{typed}");
+        assert!(refused("a", STL.as_bytes()).ends_with("; add the extension of its format"));
     }
 }

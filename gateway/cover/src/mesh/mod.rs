@@ -62,8 +62,8 @@ pub enum MeshError {
     },
     /// The extension of the file is unknown.
     #[error(
-        "mesh {file}: extension {extension:?} is none of stl, dae and obj; {}",
-        if extension.is_empty() { "add the one that it is" } else { "convert the file" }
+        "mesh {file}: the extension {extension:?} is not stl, dae or obj; {}",
+        if extension.is_empty() { "add the extension of its format" } else { "convert the file" }
     )]
     Extension {
         /// The file.
@@ -88,7 +88,7 @@ pub enum MeshError {
         fault: XmlFault,
     },
     /// The file has another format than its extension says, or is a placeholder such as a Git LFS pointer.
-    #[error("mesh {file}{}: {what}: {hint}", line.map_or_else(String::new, |line| format!(":{line}")))]
+    #[error("mesh {file}{}: this is {what}: {hint}", line.map_or_else(String::new, |line| format!(":{line}")))]
     Foreign {
         /// The file.
         file: String,
@@ -108,7 +108,7 @@ pub enum MeshError {
         reason: String,
     },
     /// The file has no triangles.
-    #[error("mesh {file}: it has no triangle; export it again, with its surface")]
+    #[error("mesh {file}: it has no triangles; export it again, with its surface")]
     Empty {
         /// The file.
         file: String,
@@ -126,7 +126,7 @@ pub enum MeshError {
         value: f64,
     },
     /// The file has more bytes, triangles or other items than allowed.
-    #[error("mesh {file}: {count} {what}, at most {most}; decimate the mesh")]
+    #[error("mesh {file}: {count} {what} are too many, the maximum is {most}; decimate the mesh")]
     TooLarge {
         /// The file.
         file: String,
@@ -138,7 +138,7 @@ pub enum MeshError {
         most: u64,
     },
     /// A dimension of a box, cylinder or sphere is not above zero, or is not finite.
-    #[error("{shape} with {what} {value} m: a size is above 0 and finite; correct it")]
+    #[error("{shape} with {what} {value} m: the size must be above 0 and finite")]
     Size {
         /// The kind of shape.
         shape: &'static str,

@@ -42,7 +42,7 @@ pub(super) fn triangles(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshE
         None => Err(damaged(
             name,
             &format!(
-                "it has {} bytes; a binary STL has {HEADER_BYTES} or more, an ASCII one begins with solid",
+                "it has {} bytes; a binary STL has {HEADER_BYTES} or more, and an ASCII STL begins with solid",
                 bytes.len()
             ),
         )),
@@ -120,7 +120,7 @@ fn parse_ascii(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
         return Ok(triangles);
     }
     let count = triangles.len();
-    let hint = if count > 0 { "; if these are all, add that line" } else { "" };
+    let hint = if count > 0 { "; if it is complete, add that line" } else { "" };
     Err(damaged(name, &format!("it ends without endsolid, after {count} triangles{hint}")))
 }
 
@@ -229,7 +229,7 @@ mod tests {
         }
         let last = &whole[..whole.find("endsolid").unwrap()];
         assert!(refused(last.as_bytes()).contains(
-            "it ends without endsolid, after 4 triangles; if these are all, add that line: it is cut off"
+            "it ends without endsolid, after 4 triangles; if it is complete, add that line: it is cut off"
         ));
         assert!(refused(b"solid arm\n").contains("after 0 triangles: it is cut off"));
         assert!(refused(whole.replace("vertex 0 1", "vertx 0 1").as_bytes()).contains("line 5: \"vertx\""));

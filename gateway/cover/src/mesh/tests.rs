@@ -208,13 +208,13 @@ fn strips_fans_and_polygons_are_cut_into_triangles() {
 fn what_is_no_mesh_is_refused_in_one_line() {
     let parse = |name: &str, text: &str| message(Mesh::parse(name, text.as_bytes(), UpAxis::Follow));
     let error = parse("hand.ply", "ply");
-    assert_eq!(error, "mesh hand.ply: extension \"ply\" is none of stl, dae and obj; convert the file");
+    assert_eq!(error, "mesh hand.ply: the extension \"ply\" is not stl, dae or obj; convert the file");
     assert!(parse("hand", "").contains("extension \"\""));
     assert!(parse("a.obj", "# nothing\n").contains("it has no triangle"));
     assert!(parse("a.obj", "v 0 0 0\nf 1 2 3\n").starts_with("mesh a.obj: "));
     assert!(parse("a.stl", "not an STL").starts_with("mesh a.stl: "));
     assert!(parse("a.dae", "<COLLADA>").starts_with("mesh a.dae: "));
-    assert_eq!(parse("a.dae", "<svg/>"), "mesh a.dae: an SVG drawing: name the mesh itself");
+    assert_eq!(parse("a.dae", "<svg/>"), "mesh a.dae: this is an SVG drawing: name the file of the mesh");
     assert!(parse("a.dae", "\n\n<COLLADA>\n&</COLLADA>").contains(": line 4: "));
     assert!(parse("a.dae", &dae("", "")).contains("it has no triangle"));
     assert!(parse("a.dae", &dae("<unit meter=\"0\"/>", PLAIN)).contains("its unit is \"0\" m"));
@@ -228,7 +228,7 @@ fn what_is_no_mesh_is_refused_in_one_line() {
     assert!(nan.contains("triangle 1 has the coordinate NaN, which is not finite"), "{nan}");
     let many = vec![[Point3::origin(); 3]; MAX_TRIANGLES + 1];
     let many = message(Mesh::new("many", many));
-    assert_eq!(many, "mesh many: 1000001 triangles, at most 1000000; decimate the mesh");
+    assert_eq!(many, "mesh many: 1000001 triangles are too many, the maximum is 1000000; decimate the mesh");
 }
 
 #[test]
@@ -237,16 +237,16 @@ fn files_that_stand_for_others_are_named() {
     for name in ["a.stl", "a.obj", "a.dae"] {
         let lfs = parse(name, "version https://git-lfs.github.com/spec/v1\noid sha256:12\nsize 3\n");
         let expected = "a Git LFS pointer to a file, not the file: fetch it with `git lfs pull`";
-        assert_eq!(lfs, format!("mesh {name}: {expected}"));
+        assert_eq!(lfs, format!("mesh {name}: this is {expected}"));
         let page = parse(name, "\n<!DOCTYPE html><html><p>404");
-        assert!(page.ends_with("as a server sends for a wrong address: download the file itself"), "{page}");
+        assert!(page.ends_with("if the address is wrong: download the file itself"), "{page}");
         let sdf = parse(name, "<?xml version='1.0'?><sdf/>");
-        assert!(sdf.contains("an SDF file, of Gazebo"), "{sdf}");
+        assert!(sdf.contains("an SDF file of Gazebo"), "{sdf}");
     }
     let renamed = parse("a.stl", "<COLLADA/>");
-    assert_eq!(renamed, "mesh a.stl: a COLLADA mesh: rename it to .dae, in the URDF too");
+    assert_eq!(renamed, "mesh a.stl: this is a COLLADA mesh: rename it to .dae, in the URDF too");
     let both = parse("a.obj", "v 0 0 0\n<<<<<<< HEAD\nv 1 0 0\n=======\nv 2 0 0\n>>>>>>> main\n");
-    assert!(both.starts_with("mesh a.obj:2: a merge conflict of git: keep one side"), "{both}");
+    assert!(both.starts_with("mesh a.obj:2: this is a merge conflict of git: keep one side"), "{both}");
 }
 
 #[test]
@@ -286,7 +286,7 @@ fn primitives_are_closed_and_as_large_as_said() {
         assert!(area.norm() < 1e-9, "closed");
     }
     let error = message(Mesh::cylinder(0.1, f64::NAN));
-    assert_eq!(error, "cylinder with length NaN m: a size is above 0 and finite; correct it");
+    assert_eq!(error, "cylinder with length NaN m: the size must be above 0 and finite");
     assert!(message(Mesh::cuboid([1.0, -1.0, 1.0])).contains("y -1 m"));
     assert!(message(Mesh::sphere(0.0)).contains("radius 0 m"));
 }

@@ -73,7 +73,7 @@ impl DataSheetInput {
         for (key, given, value, [min, max]) in all {
             let Some(given) = given else { continue };
             if !(min..=max).contains(&given) {
-                return Err(at.with_key(key).fault(given, format_args!("{min} to {max} are possible")));
+                return Err(at.with_key(key).fault(given, format_args!("must be {min} to {max}")));
             }
             *value = given;
         }

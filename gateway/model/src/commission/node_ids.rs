@@ -12,7 +12,7 @@ use thiserror::Error;
 #[non_exhaustive]
 pub enum NodeIdsError {
     /// Cells of a bus did not send a heartbeat.
-    #[error("{missing} of the {cells} cells on {bus} sent no heartbeat, so their node ids are not known")]
+    #[error("{missing} of the {cells} cells on {bus} sent no heartbeat, so their node ids are unknown")]
     Missing {
         /// Name of the bus.
         bus: String,
@@ -160,6 +160,6 @@ neighbors = [2, 0, 0, 0]
         let skin = Skin::parse("skin.toml", &text).unwrap();
         let node_ids = NodeIds::from([(7, Some(cell(2))), (2, None), (9, Some(cell(3)))]);
         let said = renumber_nodes(&skin, &text, &node_ids).unwrap_err().to_string();
-        assert_eq!(said, "1 of the 3 cells on vcan0 sent no heartbeat, so their node ids are not known");
+        assert_eq!(said, "1 of the 3 cells on vcan0 sent no heartbeat, so their node ids are unknown");
     }
 }

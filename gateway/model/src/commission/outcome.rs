@@ -83,7 +83,9 @@ pub enum FailureReason {
         other: u32,
     },
     /// The cell uses another version of the protocol.
-    #[error("uses protocol version {got}, but this program uses {VERSION}: install matching versions")]
+    #[error(
+        "uses protocol version {got}, but this program uses version {VERSION}: install matching versions"
+    )]
     Version {
         /// The version that the cell reports.
         got: u16,
@@ -97,7 +99,7 @@ pub enum FailureReason {
         tries: u8,
     },
     /// The cell refused a request.
-    #[error("refuses {step}: {}", refusal_reason(i64::from(*.code)))]
+    #[error("refused {step}: {}", refusal_reason(i64::from(*.code)))]
     Refused {
         /// The refused request.
         step: RequestStep,
@@ -109,7 +111,7 @@ pub enum FailureReason {
     Cannot(MissingAbility),
     /// The answer of the cell differs from the written value.
     #[error(
-        "answers {step} with {}, not {}",
+        "answered {step} with {} instead of {}",
         ParameterWords(.step.parameter().number(), *.got),
         ParameterWords(.step.parameter().number(), *.target)
     )]
@@ -122,7 +124,7 @@ pub enum FailureReason {
         got: [i16; WORDS],
     },
     /// The hash in the heartbeats of the cell does not match the parameters that it reads back.
-    #[error("sends the configuration hash {got:04X} in its heartbeats, not {target:04X}")]
+    #[error("sends the configuration hash {got:04X} in its heartbeats instead of {target:04X}")]
     Hash {
         /// The hash of the skin's configuration for the cell.
         target: u16,
@@ -158,7 +160,7 @@ impl AbortReason {
         match self {
             Self::OtherGateway => format!("another gateway is on {bus}: stop it first"),
             Self::OtherWriter => {
-                format!("another program configures cells on {bus}: wait until it has finished")
+                format!("another program is configuring cells on {bus}: wait until it has finished")
             }
         }
     }

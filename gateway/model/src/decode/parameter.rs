@@ -18,8 +18,8 @@ const MAX_PARAMETER_NUMBER: u8 = 127;
 pub enum ParameterTextError {
     /// The name is not that of a parameter.
     #[error(
-        "{got:?} is not a parameter: allowed are identity, mount, pose, contact, timing, mode, reply, sensing, events, \
-         links_down, baseline, tare, row1 to row6, commit, and every number from 0 to {MAX_PARAMETER_NUMBER}"
+        "{got:?} is not a parameter: use identity, mount, pose, contact, timing, mode, reply, sensing, events, \
+         links_down, baseline, tare, row1 to row6, commit, or a number from 0 to {MAX_PARAMETER_NUMBER}"
     )]
     Unknown {
         /// The given name.
@@ -27,8 +27,8 @@ pub enum ParameterTextError {
     },
     /// The parameter cannot be written.
     #[error(
-        "identity is read only: write mount, pose, contact, timing, mode, reply, sensing, events, links_down, baseline, \
-         tare, row1 to row6 or commit"
+        "identity is read-only: write mount, pose, contact, timing, mode, reply, sensing, events, links_down, \
+         baseline, tare, row1 to row6 or commit"
     )]
     ReadOnly,
     /// The number of values differs from the number of fields of the parameter.
@@ -44,7 +44,7 @@ pub enum ParameterTextError {
         got: usize,
     },
     /// More words were given than a packet has.
-    #[error("{got} words are too many for parameter {number}: at most {WORDS}")]
+    #[error("{got} words are too many for parameter {number}: give at most {WORDS}")]
     Words {
         /// The parameter.
         number: u8,
@@ -187,7 +187,7 @@ pub fn parse_raw_word(text: &str) -> Result<i16, String> {
         Some(digits) => u16::from_str_radix(digits, 16).ok().map(u16::cast_signed),
         None => text.parse().ok(),
     };
-    word.ok_or_else(|| "a word is -32768 to 32767, or 0x0 to 0xFFFF".to_owned())
+    word.ok_or_else(|| "a word must be -32768 to 32767, or 0x0 to 0xFFFF".to_owned())
 }
 
 /// Parses a finite number.
@@ -249,8 +249,8 @@ mod tests {
     fn errors_name_what_is_allowed() {
         assert_eq!(
             says("poes", &["1"]),
-            "\"poes\" is not a parameter: allowed are identity, mount, pose, contact, timing, mode, reply, sensing, events, \
-             links_down, baseline, tare, row1 to row6, commit, and every number from 0 to 127"
+            "\"poes\" is not a parameter: use identity, mount, pose, contact, timing, mode, reply, sensing, events, \
+             links_down, baseline, tare, row1 to row6, commit, or a number from 0 to 127"
         );
         assert_eq!(says("128", &[]), says("poes", &[]).replace("poes", "128"));
         assert_eq!(
@@ -267,11 +267,11 @@ mod tests {
         assert_eq!(says("commit", &["12345"]), "hash = 12345: a hash has up to 4 hexadecimal digits");
         assert_eq!(
             says("identity", &["1"]),
-            "identity is read only: write mount, pose, contact, timing, mode, reply, sensing, events, links_down, \
+            "identity is read-only: write mount, pose, contact, timing, mode, reply, sensing, events, links_down, \
              baseline, tare, row1 to row6 or commit"
         );
-        assert_eq!(says("99", &["65536"]), "word = 65536: a word is -32768 to 32767, or 0x0 to 0xFFFF");
-        assert_eq!(says("99", &["0"; 7]), "7 words are too many for parameter 99: at most 6");
+        assert_eq!(says("99", &["65536"]), "word = 65536: a word must be -32768 to 32767, or 0x0 to 0xFFFF");
+        assert_eq!(says("99", &["0"; 7]), "7 words are too many for parameter 99: give at most 6");
         assert_eq!(
             parse_write("99", &["0", "-1", "2", "3", "4", "0xFFFF"].map(str::to_owned)),
             Ok((99, [0, -1, 2, 3, 4, -1]))

@@ -28,8 +28,8 @@ pub enum FrameSelector {
 /// The given word is not a kind of frame.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[error(
-    "{got:?} is not a kind of frame: allowed are command, sum, torque, sensors, network, configure, \
-     configured, stimulus; halt, joints, sync, resume, report; wire, foreign and damaged"
+    "{got:?} is not a kind of frame: use command, sum, torque, sensors, network, configure, \
+     configured, stimulus; halt, joints, sync, resume, report; wire, foreign or damaged"
 )]
 pub struct UnknownFrameSelector {
     /// The given word.
@@ -60,9 +60,10 @@ pub fn parse_node(word: &str) -> Result<Node, String> {
     match word {
         "gateway" => Ok(Node::Gateway),
         "everyone" => Ok(Node::Everyone),
-        number => number.parse().map(Node::Cell).map_err(|_| {
-            format!("{word:?} is not a node: allowed are node ids 1 to 254, gateway and everyone")
-        }),
+        number => number
+            .parse()
+            .map(Node::Cell)
+            .map_err(|_| format!("{word:?} is not a node: use a node id from 1 to 254, gateway or everyone")),
     }
 }
 
@@ -110,7 +111,8 @@ impl FromStr for IdMask {
     fn from_str(word: &str) -> Result<Self, String> {
         let allowed = || {
             format!(
-                "{word:?} is not an identifier: allowed are up to 3 hexadecimal digits (11 bits), 8 digits (29 bits), and ID:MASK"
+                "{word:?} is not an identifier: use up to 3 hexadecimal digits (11 bits), 8 digits (29 bits), or \
+                 ID:MASK"
             )
         };
         let number = |digits: &str| {
@@ -180,9 +182,7 @@ impl FrameFilter {
         match self.parties.iter().find(is_out).filter(|_| !self.buses.is_empty()) {
             Some(NodeSelector { bus: Some(bus), node }) => {
                 let buses = self.buses.join(", ");
-                Err(format!(
-                    "{bus}:{node} is not on a selected bus ({buses}): leave out one of the two filters"
-                ))
+                Err(format!("{bus}:{node} is not on a selected bus ({buses}): omit one of the two filters"))
             }
             _ => Ok(()),
         }
@@ -317,7 +317,7 @@ mod tests {
         {
             let said = wrong.parse::<IdMask>().unwrap_err();
             assert!(
-                said.contains("3 hexadecimal digits (11 bits), 8 digits (29 bits), and ID:MASK"),
+                said.contains("3 hexadecimal digits (11 bits), 8 digits (29 bits), or ID:MASK"),
                 "{wrong}: {said}"
             );
         }
@@ -326,11 +326,8 @@ mod tests {
     #[test]
     fn unknown_words_are_errors_that_list_the_known_ones() {
         let kind = "torqe".parse::<FrameSelector>().unwrap_err().to_string();
-        assert!(
-            kind.starts_with("\"torqe\" is not a kind of frame: allowed are command, sum, torque, "),
-            "{kind}"
-        );
-        let expected = "\"255\" is not a node: allowed are node ids 1 to 254, gateway and everyone";
+        assert!(kind.starts_with("\"torqe\" is not a kind of frame: use command, sum, torque, "), "{kind}");
+        let expected = "\"255\" is not a node: use a node id from 1 to 254, gateway or everyone";
         assert_eq!(parse_node("255"), Err(expected.to_owned()));
     }
 }

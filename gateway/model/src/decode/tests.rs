@@ -353,12 +353,12 @@ fn on_a_bus_of_one_format_the_other_is_refused() {
 #[test]
 fn messages_over_wires_have_their_text() {
     let expected = [
-        "wire 12 ->: hello, no node id, port 2, a node id is missing, unreachable",
-        "wire 12 <-: hello, no node id, uplink, hears, round 3 depth 0",
+        "wire 12 ->: hello, no node id, port 2, a cell lacks a node id, unreachable",
+        "wire 12 <-: hello, no node id, uplink, receives, round 3 depth 0",
         "wire 12 ->: join",
         "wire 12 <-: grant, round 3 depth 0",
         "wire 12 ->: state, sums from epoch 255 on",
-        "wire 12 ->: hello, node id 7, port 2, hears, sums go here, round 3 depth 1",
+        "wire 12 ->: hello, node id 7, port 2, receives, sends sums here, round 3 depth 1",
         "wire 12 <-: nack, the sum of epoch 9",
         "wire 12 ->: repair, a round later than 3",
         "wire 12 <-: node_id, walk 5, 1 to 254",

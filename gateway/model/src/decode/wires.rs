@@ -60,7 +60,8 @@ fn write_hello(f: &mut Formatter<'_>, hello: Hello) -> fmt::Result {
         number => write!(f, ", node id {number}")?,
     }
     write!(f, ", {}", PortName(i64::from(port)))?;
-    for (set, word) in [(hears, "hears"), (up, "sums go here"), (unnumbered, "a node id is missing")] {
+    for (set, word) in [(hears, "receives"), (up, "sends sums here"), (unnumbered, "a cell lacks a node id")]
+    {
         if set {
             write!(f, ", {word}")?;
         }

@@ -77,7 +77,7 @@ pub enum GenerateError {
         needed: usize,
     },
     /// There are fewer cells than buses, or no cells or buses.
-    #[error("{cells} cells on {buses} buses: every bus needs at least one")]
+    #[error("{cells} cells are too few for {buses} buses: every bus needs at least one cell")]
     TooFew {
         /// Requested cells.
         cells: usize,
@@ -85,7 +85,7 @@ pub enum GenerateError {
         buses: usize,
     },
     /// There are more cells than fit on the arm.
-    #[error("{cells} cells do not fit on the arm, not even {min_mm} mm apart: ask for fewer")]
+    #[error("{cells} cells do not fit on the arm, even at a spacing of {min_mm} mm: use fewer cells")]
     NoRoom {
         /// Requested cells.
         cells: usize,

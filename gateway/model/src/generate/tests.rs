@@ -140,10 +140,10 @@ fn errors_name_what_is_allowed() {
         says(target(1_000, 3)),
         "1000 cells do not fit on 3 buses: a bus has 254 node ids; use --buses 4"
     );
-    assert_eq!(says(target(0, 1)), "0 cells on 1 buses: every bus needs at least one");
+    assert_eq!(says(target(0, 1)), "0 cells are too few for 1 buses: every bus needs at least one cell");
     assert_eq!(
         says(target(100_000, 400)),
-        "100000 cells do not fit on the arm, not even 3 mm apart: ask for fewer"
+        "100000 cells do not fit on the arm, even at a spacing of 3 mm: use fewer cells"
     );
     assert_eq!(says(target(100_000, 1)), says(target(100_000, 400)), "more buses would not help");
     assert_eq!(

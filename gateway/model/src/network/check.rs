@@ -73,10 +73,12 @@ impl WorkingDirection {
 #[derive(Clone, Debug, Eq, Error, Ord, PartialEq, PartialOrd)]
 pub enum Difference {
     /// A described cell does not send.
-    #[error("cell {0} is missing: start it, or take it out of the description")]
+    #[error("cell {0} is missing: start it, or remove it from the skin")]
     MissingCell(CellId),
     /// A cell that is not described sends on the bus.
-    #[error("cell {cell} with serial number {serial} is not described: describe it, or take it off the bus")]
+    #[error(
+        "cell {cell} with serial number {serial} is not in the skin: add it to the skin, or remove it from the bus"
+    )]
     ExtraCell {
         /// Node id of the cell.
         cell: CellId,
@@ -110,7 +112,7 @@ pub enum Difference {
     #[error("cell {0} is configured for another skin: configure it with `skinbus commission`")]
     OtherSkin(CellId),
     /// A described wire does not work.
-    #[error("the wire from {first} to {second} {}: check its plugs", carries.describe(first.cell, second.cell))]
+    #[error("the wire from {first} to {second} {}: check its connectors", carries.describe(first.cell, second.cell))]
     MissingWire {
         /// The end with the smaller node id.
         first: WireEnd,
@@ -120,10 +122,10 @@ pub enum Difference {
         carries: WorkingDirection,
     },
     /// A wire exists that is not described.
-    #[error("a wire leads from {0} to {1} and is not described: describe it, or unplug it")]
+    #[error("the wire from {0} to {1} is not in the skin: add it to the skin, or unplug it")]
     ExtraWire(WireEnd, WireEnd),
     /// A port is connected to another end than described.
-    #[error("{end} is wired to {leads} instead of {described}: move the plug, or change the description")]
+    #[error("{end} is wired to {leads} instead of {described}: correct the wiring or the skin")]
     SwappedWire {
         /// The port.
         end: WireEnd,
@@ -133,10 +135,12 @@ pub enum Difference {
         described: WireEnd,
     },
     /// A cell without a node id is connected to this port.
-    #[error("a cell without a node id is wired to {0}: the network assigns one, unless all are in use")]
+    #[error(
+        "a cell without a node id is wired to {0}: the network assigns it a free node id, if there is one"
+    )]
     Unnumbered(WireEnd),
     /// Cells whose parents form a circle, in order.
-    #[error("{} form a circle of parents, so sums would count cells twice: restart them", cell_list(.0))]
+    #[error("the parents of {} form a loop, so sums would count cells twice: restart these cells", cell_list(.0))]
     Circle(Vec<CellId>),
     /// Cells without a route to a root.
     #[error(
@@ -150,12 +154,12 @@ pub enum Difference {
 fn other_cell_message(cell: CellId, serial: u32, described: u32, belongs: Option<CellId>) -> String {
     match belongs {
         Some(belongs) => format!(
-            "node id {cell} is used by serial number {serial}, which is cell {belongs} in the description; \
-             cell {cell} has serial number {described} there: swap the cells, or their serial numbers in the description"
+            "the cell with serial number {serial} uses node id {cell}, but in the skin it is cell {belongs}, and cell \
+             {cell} has serial number {described}: swap the cells, or their serial numbers in the skin"
         ),
         None => format!(
-            "cell {cell} has serial number {serial}, but {described} in the description: write {serial} into the \
-             description, or put the other cell back"
+            "cell {cell} has serial number {serial}, but {described} in the skin: write {serial} into the skin, or \
+             put the other cell back"
         ),
     }
 }
@@ -166,7 +170,7 @@ fn other_version_message(version: Option<u16>) -> String {
             "version {version} of the protocol, but this gateway uses version {VERSION}: install matching versions"
         ),
         None => {
-            "another version of the protocol than its neighbours: install the same firmware on all of them"
+            "a protocol version that differs from its neighbours': install the same firmware on all of them"
                 .to_owned()
         }
     }

@@ -34,7 +34,7 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
     let robot = &skin.robot;
     let joints = |key, values: &[f64]| {
         if values.len() != robot.joints.len() {
-            let why = format!("one value for each of the robot's {} joints is needed", robot.joints.len());
+            let why = format!("must have one value for each of the robot's {} joints", robot.joints.len());
             return Err(at.with_key(key).fault(format_args!("{} values", values.len()), why));
         }
         Ok(core::array::from_fn(|joint| values.get(joint).copied().unwrap_or(0.0)))
@@ -50,8 +50,8 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
         value_or_former_key(&at, ("amplitude", &raw.amplitude), ("amplitude_rad", &raw.amplitude_rad))?;
     let kinds =
         [("hold", Some(MotionKind::Hold)), ("sine", None), ("kinesthetic", Some(MotionKind::Kinesthetic))];
-    let needed = "needed with kind = \"sine\"";
-    let only = "only with kind = \"sine\"";
+    let needed = "required with kind = \"sine\"";
+    let only = "allowed only with kind = \"sine\"";
     let (kind, reach) = match (at.with_key("kind").parse_choice(&raw.kind, &kinds)?, amplitude, raw.period_s)
     {
         (Some(kind), None, None) => (kind, [0.0; MAX_ROBOT_JOINTS]),
@@ -87,7 +87,7 @@ fn value_or_former_key<'a, T>(
 ) -> Checked<(&'static str, Option<&'a T>)> {
     match (value, given) {
         (Some(_), Some(_)) => {
-            Err(at.with_key(former).fault("", format_args!("the former name of {key}: give one of them")))
+            Err(at.with_key(former).fault("", format_args!("is the former name of {key}: use only one")))
         }
         (None, Some(given)) => Ok((former, Some(given))),
         (value, None) => Ok((key, value.as_ref())),
@@ -121,7 +121,7 @@ fn modes(raw: &[raw::Mode], end: ScenarioDuration) -> Checked<Vec<ModeChange>> {
         let path = KeyPath::top_level_key("mode").with_index(index);
         let at = end.check_time_before_end(&path.with_key("at_s"), raw.at_s)?;
         if modes.last().is_some_and(|last| last.at >= at) {
-            return Err(path.with_key("at_s").fault(raw.at_s, "modes must be in order of time"));
+            return Err(path.with_key("at_s").fault(raw.at_s, "modes must be in the order of their times"));
         }
         let kinds = [TorqueSource::Compare, TorqueSource::Distributed].map(|mode| (mode.name(), mode));
         modes.push(ModeChange { at, mode: path.with_key("kind").parse_choice(&raw.kind, &kinds)? });
@@ -139,7 +139,7 @@ fn check_repeat(raw: &[raw::Touch], touches: &[Touch], seconds: f64) -> Checked<
             let key = if raw.for_s.is_some() { "for_s" } else { "at_s" };
             let got = raw.for_s.unwrap_or(raw.at_s);
             let why =
-                format_args!("the touch must end before touches_repeat_s = {seconds}, when all begin again");
+                format_args!("the touch must end before all touches repeat at touches_repeat_s = {seconds}");
             return Err(KeyPath::top_level_key("touch").with_index(index).with_key(key).fault(got, why));
         }
     }

@@ -7,8 +7,9 @@ use super::names::{CellSelection, NameTable};
 use super::times::{ScenarioDuration, check_duration};
 use super::{BusFault, Fault, FaultKind, ProcessAction, SensorFault, raw};
 
-pub(super) const FAULT_KINDS: &str = "of processes \"kill\", \"stop\", \"continue\", \"restart\"; of wires \"link_down\", \"link_up\"; of sensors \
-     \"stuck\", \"drift\"; of buses \"drop\", \"delay\", \"duplicate\", \"corrupt\", \"reorder\", \"babble\"";
+pub(super) const FAULT_KINDS: &str = "must be a fault of processes: \"kill\", \"stop\", \"continue\", \"restart\"; \
+     of wires: \"link_down\", \"link_up\"; of sensors: \"stuck\", \"drift\"; or of buses: \"drop\", \"delay\", \
+     \"duplicate\", \"corrupt\", \"reorder\", \"babble\"";
 
 /// Checks the faults and sorts them by time.
 pub(super) fn faults(
@@ -67,7 +68,7 @@ impl FaultEntry<'_> {
                 let got = raw.id.unwrap_or(0);
                 let id = u16::try_from(got).ok().filter(|&id| id < 0x800);
                 let id =
-                    id.ok_or_else(|| self.at.with_key("id").fault(got, "an identifier is 0 to 0x7FF"))?;
+                    id.ok_or_else(|| self.at.with_key("id").fault(got, "an identifier must be 0 to 0x7FF"))?;
                 self.bus_fault(BusFault::Babble { frames_per_s, id }, &["for_s", "frames_per_s", "id"])?
             }
             got => return Err(self.at.with_key("kind").fault(format_args!("{got:?}"), FAULT_KINDS)),
@@ -83,7 +84,7 @@ impl FaultEntry<'_> {
     fn wire_fault(&self, link_down: bool, keys: &[&str]) -> Checked<FaultKind> {
         self.refuse_other_keys(keys)?;
         if self.raw.all {
-            return Err(self.at.with_key("all").fault(true, "the two cells of a wire are needed"));
+            return Err(self.at.with_key("all").fault(true, "name the two cells of the wire with cells"));
         }
         let (from, to) = self.names.wired_pair(self.selection())?;
         Ok(FaultKind::Wire { link_down, from, to, both_ways: !self.raw.one_way.unwrap_or(false) })
@@ -136,7 +137,7 @@ impl FaultEntry<'_> {
 
     fn delay(&self) -> Checked<Span> {
         let wrong = |got: String| {
-            self.at.with_key("delay_us").fault(got, "1 to 1000000 us are needed with kind = \"delay\"")
+            self.at.with_key("delay_us").fault(got, "must be 1 to 1000000 us with kind = \"delay\"")
         };
         let got = self.raw.delay_us.ok_or_else(|| wrong(String::new()))?;
         let delay = u64::try_from(got).ok().filter(|delay| (1..=1_000_000).contains(delay));
@@ -146,8 +147,8 @@ impl FaultEntry<'_> {
     /// Returns a number that this kind of fault requires; it must be from `min` to `max`.
     fn required_number(&self, key: &'static str, value: Option<f64>, min: f64, max: f64) -> Checked<f64> {
         let why = || match (min, max) {
-            (f64::NEG_INFINITY, _) => format!("a finite number is needed with kind = {:?}", self.raw.kind),
-            _ => format!("{min} to {max} are needed with kind = {:?}", self.raw.kind),
+            (f64::NEG_INFINITY, _) => format!("must be a finite number with kind = {:?}", self.raw.kind),
+            _ => format!("must be {min} to {max} with kind = {:?}", self.raw.kind),
         };
         let given = value.filter(|value| value.is_finite() && (min..=max).contains(value));
         given.ok_or_else(|| {

@@ -361,7 +361,7 @@ impl Scenario {
     /// # Errors
     /// Returns [`DocumentError`] with the first fault in the text.
     pub fn parse(path: &str, text: &str, skin: &Skin) -> Result<Self, DocumentError> {
-        let what = "this is a skin, not a scenario: `skinbus run SKIN --scenario SCENARIO` takes both";
+        let what = "this is a skin, not a scenario: give both, as in `skinbus run SKIN --scenario SCENARIO`";
         document::parse(path, text, |raw| check::scenario(raw, skin))
             .map_err(|error: DocumentError| error.detect_wrong_kind(text, SKIN_KEYS, &[], what))
     }

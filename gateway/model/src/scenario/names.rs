@@ -49,7 +49,8 @@ impl<'a> NameTable<'a> {
 
     /// Returns the index of the bus with this name. Errors show `at` and `value` as the key and its value.
     fn bus_named(&self, at: &KeyPath, value: &dyn core::fmt::Display, name: &str) -> Checked<usize> {
-        let wrong = || at.fault(value, format_args!("no such bus; there is {}", self.bus_names_text()));
+        let wrong =
+            || at.fault(value, format_args!("the skin has no such bus, only {}", self.bus_names_text()));
         self.skin.bus_index(name).ok_or_else(wrong)
     }
 
@@ -67,7 +68,7 @@ impl<'a> NameTable<'a> {
             None => {
                 let first = self.bus_name(0);
                 let why = format_args!(
-                    "which bus? there is {}; a cell of one is also \"{first}:1\"",
+                    "name a bus, of {}; or name each cell with its bus, as in \"{first}:1\"",
                     self.bus_names_text()
                 );
                 Err(at.fault("", why))
@@ -100,8 +101,8 @@ impl<'a> NameTable<'a> {
             }
         };
         self.index.get(&(bus, node)).copied().ok_or_else(|| {
-            let why =
-                format!("no cell of {:?} has node {node}: {}", self.bus_name(bus), self.node_ids_text(bus));
+            let (name, ids) = (self.bus_name(bus), self.node_ids_text(bus));
+            let why = format!("no cell of {name:?} has node id {node}: {ids}");
             at.fault(named, why)
         })
     }
@@ -141,7 +142,7 @@ impl<'a> NameTable<'a> {
         let path = given.at.with_key("cells");
         match given.cells {
             Some(_) if given.all => Err(path.fault("", "give either cells or all = true, not both")),
-            None if !given.all => Err(path.fault("", "which cells? give their node ids, or all = true")),
+            None if !given.all => Err(path.fault("", "give the node ids of the cells, or all = true")),
             None => {
                 let bus = given.bus.map(|_| self.bus_of_key(given)).transpose()?;
                 let cells = self.skin.cells.iter().enumerate();
@@ -166,7 +167,7 @@ impl<'a> NameTable<'a> {
             let at = path.with_index(index);
             if !is_here(self.cell(&at, named, given)?) {
                 let why = format_args!(
-                    "this fault is on one bus, {:?}: use another table for this cell",
+                    "this fault is on the bus {:?} only: use another [[fault]] table for this cell",
                     self.bus_name(bus)
                 );
                 return Err(at.fault(named, why));
@@ -182,13 +183,14 @@ impl<'a> NameTable<'a> {
         self.cells(given)?;
         let named = given.cells.unwrap_or_default();
         let [one, other] = named else {
-            return Err(path.fault(format_args!("{} cells", named.len()), "a wire connects two cells"));
+            let got = format!("{} cells", named.len());
+            return Err(path.fault(got, "name the two cells that the wire connects"));
         };
         let bus = self.bus(given)?;
         self.listed_cells_on_bus(given, bus)?;
         let described = self.skin.buses.get(bus);
         if described.is_some_and(|bus| bus.reply == SkinReply::Torque) {
-            return Err(path.fault("", "wires are used on a bus with reply = \"sum\" only"));
+            return Err(path.fault("", "only a bus with reply = \"sum\" uses wires"));
         }
         let wires = self.skin.wires(bus);
         let node = |cell: usize| self.skin.cells.get(cell).map(|cell| cell.node);
@@ -257,28 +259,28 @@ mod tests {
 
     #[test]
     fn a_cell_that_is_not_there_is_named_beside_those_that_are() {
-        let which = "which bus? there is \"vcan0\", \"vcan1\"; a cell of one is also \"vcan0:1\"";
+        let which = "name a bus, of \"vcan0\", \"vcan1\"; or name each cell with its bus, as in \"vcan0:1\"";
         for (keys, said) in [
             (
                 "cells = [\"vcan0:9\"]",
-                "s.toml:4:10: touch[0].cells[0] = \"vcan0:9\": no cell of \"vcan0\" has node 9: it has 1-3",
+                "s.toml:4:10: touch[0].cells[0] = \"vcan0:9\": no cell of \"vcan0\" has node id 9: it has 1-3",
             ),
             (
                 "bus = \"vcan1\"\ncells = [1, 2]",
-                "touch[0].cells[1] = 2: no cell of \"vcan1\" has node 2: it has 1, 5",
+                "touch[0].cells[1] = 2: no cell of \"vcan1\" has node id 2: it has 1, 5",
             ),
             (
                 "cells = [\"can0:1\"]",
-                "touch[0].cells[0] = \"can0:1\": no such bus; there is \"vcan0\", \"vcan1\"",
+                "touch[0].cells[0] = \"can0:1\": the skin has no such bus, only \"vcan0\", \"vcan1\"",
             ),
             ("cells = [\"vcan0:1\", 2]", &format!("touch[0].bus: {which}")),
             (
                 "cells = [\"vcan0:x\"]",
                 "touch[0].cells[0] = \"vcan0:x\": \"x\" is not a node id: use 1 to 254",
             ),
-            ("cells = [2.5]", "touch[0].cells[0] = 2.5: either a node id or \"BUS:NODE\" is needed"),
+            ("cells = [2.5]", "touch[0].cells[0] = 2.5: must be either a node id or \"BUS:NODE\""),
             ("cells = [99999999999999999999]", "touch[0].cells[0] = 99999999999999999999: "),
-            ("bus = \"can9\"\ncells = [\"vcan0:1\"]", "touch[0].bus = \"can9\": no such bus"),
+            ("bus = \"can9\"\ncells = [\"vcan0:1\"]", "touch[0].bus = \"can9\": the skin has no such bus"),
             (
                 "bus = \"vcan0\"\ncells = [1, \"vcan0:1\"]",
                 "touch[0].cells[1] = \"vcan0:1\": cells[0] is the same cell",
@@ -288,9 +290,10 @@ mod tests {
             assert!(got.contains(said), "{keys}\n{got}");
         }
         let two = "kind = \"drop\"\nprobability = 0.5\ncells = [\"vcan0:1\", \"vcan1:5\"]";
-        let said = "fault[0].cells[1] = \"vcan1:5\": this fault is on one bus, \"vcan0\": use another table for this cell";
+        let said = "fault[0].cells[1] = \"vcan1:5\": this fault is on the bus \"vcan0\" only: use another \
+                    [[fault]] table for this cell";
         assert!(fault(two).unwrap_err().contains(said));
         let wire = fault("kind = \"link_down\"\ncells = [\"vcan0:1\", \"vcan1:5\"]").unwrap_err();
-        assert!(wire.contains("this fault is on one bus, \"vcan0\""), "{wire}");
+        assert!(wire.contains("this fault is on the bus \"vcan0\" only"), "{wire}");
     }
 }

@@ -51,19 +51,19 @@ fn profile_from_name(at: &KeyPath, raw: &raw::Touch, word: &str) -> Checked<(For
         .map(|profile| (profile.name(), profile));
     let Some((_, profile)) = profiles.iter().find(|(name, _)| *name == word).cloned() else {
         let words = profiles.map(|(name, _)| format!("{name:?}")).join(", ");
-        let why = format!("{words} or points [[t_s, force_n], ...]");
+        let why = format!("must be {words} or points [[t_s, force_n], ...]");
         return Err(at.with_key("profile").fault(format_args!("{word:?}"), why));
     };
     let at_force = at.with_key("force_n");
     let Some(force_n) = raw.force_n else {
-        return Err(at_force.fault("", format_args!("needed with profile = {word:?}")));
+        return Err(at_force.fault("", format_args!("required with profile = {word:?}")));
     };
     check_force(&at_force, force_n)?;
     let length = match (raw.for_s, &profile) {
         (Some(seconds), _) => check_duration(&at.with_key("for_s"), seconds)?,
         (None, ForceProfile::Step) => Span(u64::MAX),
         (None, ForceProfile::HalfSine | ForceProfile::Ramp | ForceProfile::Points(_)) => {
-            return Err(at.with_key("for_s").fault("", format_args!("needed with profile = {word:?}")));
+            return Err(at.with_key("for_s").fault("", format_args!("required with profile = {word:?}")));
         }
     };
     Ok((profile, length, force_n))
@@ -81,7 +81,7 @@ fn profile_from_points(
     for (index, given) in given.iter().enumerate() {
         let point = path.with_index(index);
         let &[seconds, force_n] = given.as_slice() else {
-            let why = format_args!("a point is two numbers, [t_s, force_n], not {}", given.len());
+            let why = format_args!("a point must be two numbers [t_s, force_n], not {}", given.len());
             return Err(point.fault("", why));
         };
         if !(0.0..=MAX_DURATION_S).contains(&seconds) {
@@ -103,7 +103,7 @@ fn profile_from_points(
     let Some(&(length, _)) = points.last().filter(|(last, _)| *last > Span(0)) else {
         let got = if given.is_empty() { "[]" } else { "" };
         return Err(
-            path.fault(got, "a point [t_s, force_n] with t_s above 0 is needed: there the touch ends")
+            path.fault(got, "the last point [t_s, force_n] is the end of the touch: its t_s must be above 0")
         );
     };
     if let Some(for_s) =
@@ -212,9 +212,9 @@ mod tests {
         for (touch, said) in [
             (
                 "profile = []",
-                "4:11: touch[0].profile = []: a point [t_s, force_n] with t_s above 0 is needed",
+                "4:11: touch[0].profile = []: the last point [t_s, force_n] is the end of the touch",
             ),
-            ("profile = [[0.0, 3.0]]", "4:11: touch[0].profile: a point [t_s, force_n] with t_s above 0"),
+            ("profile = [[0.0, 3.0]]", "4:11: touch[0].profile: the last point [t_s, force_n] is the end"),
             (
                 "profile = [[1.0, 3.0], [0.5, 2.0]]",
                 "4:25: touch[0].profile[1][0] = 0.5: the times of points must increase",
@@ -230,17 +230,18 @@ mod tests {
             ("profile = [[1.0, nan]]", "4:18: touch[0].profile[0][1] = NaN: must be 0 to 95.997 N"),
             (
                 "profile = [[1.0, 3.0, 2.0]]",
-                "4:12: touch[0].profile[0]: a point is two numbers, [t_s, force_n], not 3",
+                "4:12: touch[0].profile[0]: a point must be two numbers [t_s, force_n], not 3",
             ),
-            ("profile = [[1.0, \"3 N\"]]", "4:18: touch[0].profile[0][1] = \"3 N\": a number is needed"),
+            ("profile = [[1.0, \"3 N\"]]", "4:18: touch[0].profile[0][1] = \"3 N\": must be a number"),
             (
                 "profile = [[1.0, 3.0], [2.0]]",
-                "4:24: touch[0].profile[1]: a point is two numbers, [t_s, force_n], not 1",
+                "4:24: touch[0].profile[1]: a point must be two numbers [t_s, force_n], not 1",
             ),
-            ("profile = [1.0, 3.0]", "touch[0].profile[0] = 1.0: a list of values in brackets is needed"),
+            ("profile = [1.0, 3.0]", "touch[0].profile[0] = 1.0: must be a list of values in brackets"),
             (
                 "profile = 3.0",
-                "4:11: touch[0].profile = 3.0: either a word in quotes or a list of points [[t_s, force_n], ...] is needed",
+                "4:11: touch[0].profile = 3.0: must be either a word in quotes or a list of points [[t_s, \
+                 force_n], ...]",
             ),
             (
                 "profile = [[1.0, 3.0]]\nfor_s = 2.0",
@@ -250,7 +251,7 @@ mod tests {
                 "force_n = 2.0\nprofile = [[1.0, 3.0]]",
                 "4:11: touch[0].force_n = 2: the largest force of the profile's points is 3 N: omit force_n",
             ),
-            ("", "1:1: touch[0].force_n: needed with profile = \"step\""),
+            ("", "1:1: touch[0].force_n: required with profile = \"step\""),
             ("force_n = 3.0\nprofile = \"poke\"", "\"ramp\" or points [[t_s, force_n], ...]"),
             (
                 "profile = [[1.0, 90.0]]\n[[touch]]\nall = true\nprofile = [[2.0, 7.0]]",

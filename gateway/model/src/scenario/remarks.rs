@@ -23,7 +23,7 @@ fn unused_controller_warning(motion: MotionKind, skin: &Skin) -> Option<String> 
     unused.then(|| {
         format!(
             "motion.kind = {:?}: the scenario moves the robot, and the external controller at {socket} is not used; \
-             with \"kinesthetic\" the controller moves it",
+             use \"kinesthetic\" to let the controller move it",
             motion.name()
         )
     })

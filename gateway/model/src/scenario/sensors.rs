@@ -120,7 +120,7 @@ fn check_temperature_course(
         let at = at.with_index(index);
         let moment = end.check_time_up_to_end(&at.with_index(0), seconds)?;
         if temperature.last().is_some_and(|(last, _)| *last >= moment) {
-            return Err(at.with_index(0).fault(seconds, "times must increase"));
+            return Err(at.with_index(0).fault(seconds, "the times must increase"));
         }
         at.with_index(1).to_fixed(degrees, Q9_6::try_nearest)?;
         temperature.push((moment, degrees));
@@ -150,7 +150,7 @@ fn check_force_errors(at: &KeyPath, raw: &raw::ForceErrors) -> Checked<ForceErro
     for (key, given, error, max) in keys {
         let Some(given) = given else { continue };
         if !(0.0..=max).contains(&given) {
-            return Err(at.with_key(key).fault(given, format_args!("0 to {max} are possible")));
+            return Err(at.with_key(key).fault(given, format_args!("must be 0 to {max}")));
         }
         *error = given;
     }
@@ -204,17 +204,17 @@ mod tests {
         let cases = [
             (
                 "[sensors]\ntemperature_c = [[0.0, 25.0], [0.0, 26.0]]\n",
-                "sensors.temperature_c[1][0] = 0: times must increase",
+                "sensors.temperature_c[1][0] = 0: the times must increase",
             ),
-            ("[sensors]\ntemperature_c = [[601.0, 25.0]]\n", "the scenario goes from 0 to duration_s = 600"),
-            ("[sensors.force]\nkind = \"good\"\n", "\"perfect\", \"piezoresistive\" or \"resistive\""),
-            ("[sensors.force]\ngain = 1.0\n", "sensors.force.gain = 1: 0 to 0.9 are possible"),
-            ("[sensors.force]\nnoise_n = nan\n", "sensors.force.noise_n = NaN: 0 to 1 are possible"),
-            ("[sensors.acceleration]\nkind = \"good\"\n", "\"perfect\" or \"bma250\""),
             (
-                "[sensors.acceleration]\nrange_g = 1.0\n",
-                "sensors.acceleration.range_g = 1: 1.2 to 8 are possible",
+                "[sensors]\ntemperature_c = [[601.0, 25.0]]\n",
+                "must be within the scenario, from 0 to duration_s = 600",
             ),
+            ("[sensors.force]\nkind = \"good\"\n", "\"perfect\", \"piezoresistive\" or \"resistive\""),
+            ("[sensors.force]\ngain = 1.0\n", "sensors.force.gain = 1: must be 0 to 0.9"),
+            ("[sensors.force]\nnoise_n = nan\n", "sensors.force.noise_n = NaN: must be 0 to 1"),
+            ("[sensors.acceleration]\nkind = \"good\"\n", "\"perfect\" or \"bma250\""),
+            ("[sensors.acceleration]\nrange_g = 1.0\n", "sensors.acceleration.range_g = 1: must be 1.2 to 8"),
             ("[sensors]\noffset = 1\n", "unknown field `offset`"),
         ];
         for (text, why) in cases {

@@ -200,8 +200,8 @@ fn what_has_no_effect_is_remarked() {
 fn what_comes_and_goes_needs_a_length_and_a_skin_is_no_scenario() {
     let said = |text: &str| Scenario::parse("s.toml", text, &one_cell_skin()).unwrap_err().to_string();
     let endless = "[[touch]]\nall = true\nforce_n = 3.0\nprofile = \"half-sine\"\n";
-    assert_eq!(said(endless), "s.toml:1:1: touch[0].for_s: needed with profile = \"half-sine\"");
-    let taken = "this is a skin, not a scenario: `skinbus run SKIN --scenario SCENARIO` takes both";
+    assert_eq!(said(endless), "s.toml:1:1: touch[0].for_s: required with profile = \"half-sine\"");
+    let taken = "this is a skin, not a scenario: give both, as in `skinbus run SKIN --scenario SCENARIO`";
     assert_eq!(said(ONE_CELL_SKIN_TOML), format!("s.toml: {taken}"));
 }
 
@@ -212,13 +212,16 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     assert_eq!(says("seed = 7", "seed = -7"), "s.toml:3: seed = -7: must not be negative");
     assert_eq!(
         says("\"sine\"", "\"dance\""),
-        "s.toml:6: motion.kind = \"dance\": \"hold\", \"sine\" or \"kinesthetic\""
+        "s.toml:6: motion.kind = \"dance\": must be \"hold\", \"sine\" or \"kinesthetic\""
     );
-    assert_eq!(says("\"sine\"", "\"hold\""), "s.toml:8: motion.amplitude_rad: only with kind = \"sine\"");
-    assert_eq!(says("period_s = 4.0\n", ""), "s.toml:5: motion.period_s: needed with kind = \"sine\"");
+    assert_eq!(
+        says("\"sine\"", "\"hold\""),
+        "s.toml:8: motion.amplitude_rad: allowed only with kind = \"sine\""
+    );
+    assert_eq!(says("period_s = 4.0\n", ""), "s.toml:5: motion.period_s: required with kind = \"sine\"");
     assert_eq!(
         says("-1.57, 0.0]", "-1.57]"),
-        "s.toml:7: motion.start_rad = 5 values: one value for each of the robot's 6 joints is needed"
+        "s.toml:7: motion.start_rad = 5 values: must have one value for each of the robot's 6 joints"
     );
     assert_eq!(
         says("start_rad = [0.0", "start_rad = [6.0"),
@@ -230,29 +233,29 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("at_s = 5.7", "at_s = 0.0"),
-        "s.toml:15: mode[1].at_s = 0: modes must be in order of time"
+        "s.toml:15: mode[1].at_s = 0: modes must be in the order of their times"
     );
     assert_eq!(
         says("\"distributed\"", "\"central\""),
-        "s.toml:16: mode[1].kind = \"central\": \"compare\" or \"distributed\""
+        "s.toml:16: mode[1].kind = \"central\": must be \"compare\" or \"distributed\""
     );
     assert_eq!(
         says("at_s = 2.0", "at_s = 12.0"),
-        "s.toml:19: touch[0].at_s = 12: the scenario goes from 0 to duration_s = 12"
+        "s.toml:19: touch[0].at_s = 12: must be within the scenario, from 0 to duration_s = 12"
     );
     assert_eq!(
         says("\"vcan0\"", "\"vcan7\""),
-        "s.toml:21: touch[0].bus = \"vcan7\": no such bus; there is \"vcan0\""
+        "s.toml:21: touch[0].bus = \"vcan7\": the skin has no such bus, only \"vcan0\""
     );
     assert_eq!(
         says("[1, 3]", "[1, 4]"),
-        "s.toml:22: touch[0].cells[1] = 4: no cell of \"vcan0\" has node 4: it has 1-3"
+        "s.toml:22: touch[0].cells[1] = 4: no cell of \"vcan0\" has node id 4: it has 1-3"
     );
     assert_eq!(says("[1, 3]", "[1, 1]"), "s.toml:22: touch[0].cells[1] = 1: cells[0] is the same cell");
     assert_eq!(says("[1, 3]", "[]"), "s.toml:22: touch[0].cells = []: at least one cell is needed");
     assert_eq!(
         says("cells = [1, 3]\n", ""),
-        "s.toml:18: touch[0].cells: which cells? give their node ids, or all = true"
+        "s.toml:18: touch[0].cells: give the node ids of the cells, or all = true"
     );
     assert_eq!(
         says("force_n = 3.0", "force_n = 96.0"),
@@ -260,9 +263,10 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("\"step\"", "\"poke\""),
-        "s.toml:31: touch[1].profile = \"poke\": \"half-sine\", \"step\", \"ramp\" or points [[t_s, force_n], ...]"
+        "s.toml:31: touch[1].profile = \"poke\": must be \"half-sine\", \"step\", \"ramp\" or points \
+         [[t_s, force_n], ...]"
     );
-    assert_eq!(says("31.5]", "600.0]"), "s.toml:33: touch[1].temperature_c = 600: the range is [-512, 512)");
+    assert_eq!(says("31.5]", "600.0]"), "s.toml:33: touch[1].temperature_c = 600: must be in [-512, 512)");
     assert_eq!(
         says("cells = [2]\nforce_n = 1.0", "all = true\nforce_n = 94.0"),
         "s.toml:30: touch[1].force_n = 94: together with earlier touches this makes 97 N on cell 1 of \
@@ -270,18 +274,19 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("probability = 0.25", "probability = 25"),
-        "s.toml:40: fault[0].probability = 25: 0 to 1 are needed with kind = \"delay\""
+        "s.toml:40: fault[0].probability = 25: must be 0 to 1 with kind = \"delay\""
     );
     assert_eq!(
         says("delay_us = 3000\n", ""),
-        "s.toml:35: fault[0].delay_us: 1 to 1000000 us are needed with kind = \"delay\""
+        "s.toml:35: fault[0].delay_us: must be 1 to 1000000 us with kind = \"delay\""
     );
     assert_eq!(
         says("kind = \"kill\"", "kind = \"kill\"\nprobability = 0.5"),
         "s.toml:46: fault[1].probability: is not allowed with kind = \"kill\""
     );
     assert!(
-        says("\"kill\"", "\"kil\"").starts_with("s.toml:45: fault[1].kind = \"kil\": of processes \"kill\"")
+        says("\"kill\"", "\"kil\"")
+            .starts_with("s.toml:45: fault[1].kind = \"kil\": must be a fault of processes: \"kill\"")
     );
     assert_eq!(
         says("for_s = 1.6", "for = 1.6"),
@@ -301,12 +306,12 @@ fn with_several_buses_the_bus_must_be_named() {
     let text = "version = 1\nduration_s = 1.0\n[[fault]]\nat_s = 0.5\nkind = \"kill\"\ncells = [1]\n";
     assert_eq!(
         by_line(Scenario::parse("s.toml", text, &skin).unwrap_err()),
-        "s.toml:3: fault[0].bus: which bus? there is \"vcan0\", \"vcan1\"; a cell of one is also \"vcan0:1\""
+        "s.toml:3: fault[0].bus: name a bus, of \"vcan0\", \"vcan1\"; or name each cell with its bus, as in \"vcan0:1\""
     );
     let text = format!("{text}bus = \"vcan1\"\n");
     assert_eq!(
         by_line(Scenario::parse("s.toml", &text, &skin).unwrap_err()),
-        "s.toml:6: fault[0].cells[0] = 1: no cell of \"vcan1\" has node 1: it has no cells"
+        "s.toml:6: fault[0].cells[0] = 1: no cell of \"vcan1\" has node id 1: it has no cells"
     );
 }
 
@@ -470,7 +475,7 @@ fn a_link_between_two_wired_cells_goes_down_and_comes_up_in_time() {
     );
     assert_eq!(
         wrong(&sums, "kind = \"link_down\"\ncells = [1]"),
-        "s.toml:6: fault[0].cells = 1 cells: a wire connects two cells"
+        "s.toml:6: fault[0].cells = 1 cells: name the two cells that the wire connects"
     );
     assert_eq!(
         wrong(&sums, "kind = \"link_up\"\nfor_s = 1.0\ncells = [1, 2]"),
@@ -479,6 +484,6 @@ fn a_link_between_two_wired_cells_goes_down_and_comes_up_in_time() {
     let torques = described("reply = \"torque\"", line);
     assert_eq!(
         wrong(&torques, "kind = \"link_down\"\ncells = [1, 2]"),
-        "s.toml:6: fault[0].cells: wires are used on a bus with reply = \"sum\" only"
+        "s.toml:6: fault[0].cells: only a bus with reply = \"sum\" uses wires"
     );
 }

@@ -25,7 +25,7 @@ impl ScenarioDuration {
     }
 
     fn out_of_range_error(self, at: &KeyPath, seconds: f64) -> Checked<Micros> {
-        let why = format_args!("the scenario goes from 0 to duration_s = {}", self.0);
+        let why = format_args!("must be within the scenario, from 0 to duration_s = {}", self.0);
         Err(at.fault(seconds, why))
     }
 }

@@ -20,7 +20,7 @@ impl TouchValues {
     /// Checks the keys of a touch.
     pub(super) fn check(at: &KeyPath, raw: &raw::Touch) -> Checked<Self> {
         if !(0.0..=1.0).contains(&raw.proximity) {
-            return Err(at.with_key("proximity").fault(raw.proximity, "0 (nothing near) to 1 are possible"));
+            return Err(at.with_key("proximity").fault(raw.proximity, "must be 0 (nothing near) to 1"));
         }
         let degrees = |got| at.with_key("temperature_c").to_fixed(got, Q::try_nearest);
         let temperature = match raw.temperature_c {

@@ -19,18 +19,19 @@ const MAX_TICK_RATIO_SAME_BUSES: f64 = 1.2;
 pub fn scale_section(measured: &ScaleMeasurements) -> Section {
     let ScaleMeasurements { sizes, ticks, beside } = measured;
     let most = sizes.last();
-    Section::new("scale", "A bench over its cells")
+    Section::new("scale", "Benches by number of cells")
         .with_paragraph(format!(
-            "Whole benches on as few embedded buses as have enough node ids, with one process for all cells of a bus: first \
-             with {} % of the cells touched, at half the rate if fewer than {} % of the replies come in time, and if necessary once more \
-             at half of that; then with none touched, at the same rate.",
+            "Each bench has as few embedded buses as have enough node ids, and one process for all cells of a bus. \
+             It first runs with {} % of the cells touched. If fewer than {} % of the replies arrive in time, it runs \
+             again at half the rate, and if necessary once more at half of that. Then it runs with no cell touched, \
+             at the same rate.",
             ACTIVE_SHARE * 100.0,
             MIN_IN_TIME_SHARE * 100.0
         ))
         .with_paragraph(
-            "A tick of a bench is the median of those that computed nothing centrally. Ticks over cells are those of a loop \
-             without threads, with every cell active, on as many buses for all numbers of cells; the central computation is \
-             timed in the same rounds.",
+            "The time of a tick of a bench is the median of the ticks without a central computation. The times of a \
+             tick by number of cells are those of a loop without threads, with every cell active and the same number \
+             of buses for all numbers of cells; the central computation is timed in the same rounds.",
         )
         .with_figures(bench_figures(sizes))
         .with_figures([tick_time_figure(ticks)])
@@ -60,13 +61,13 @@ fn figure_over_cells<const N: usize>(
 fn bench_figures(sizes: &[SizeFigures]) -> [Figure; 7] {
     [
         figure_over_cells(
-            ("start", "From the start to the first joints"),
+            ("start", "Time from the start to the first joints"),
             Axis::new("time", "s"),
             sizes,
             [("none active", |size| size.quiet.start_s), ("5 % active", |size| size.active.start_s)],
         ),
         figure_over_cells(
-            ("processor", "Processor, 5 % active"),
+            ("processor", "Processor use, 5 % active"),
             Axis::new("processor", "cores"),
             sizes,
             [
@@ -83,19 +84,19 @@ fn bench_figures(sizes: &[SizeFigures]) -> [Figure; 7] {
             sizes,
             [
                 ("gateway", |size| size.active.memory_mb[0]),
-                ("all that serves buses", |size| size.active.memory_mb[1]),
+                ("all bus servers", |size| size.active.memory_mb[1]),
                 ("the largest process of cells", |size| size.active.memory_mb[2]),
             ],
         ),
         figure_over_cells(
-            ("tick", "Median of the distributed tick"),
+            ("tick", "Median time of a distributed tick"),
             Axis::new("time in a tick", "µs"),
             sizes,
             [("none active", |size| size.quiet.tick_us), ("5 % active", |size| size.active.tick_us)],
         ),
         figure_over_cells(
-            ("late", "Lateness of 99 % of the ticks"),
-            Axis::new("late by at most", "µs"),
+            ("late", "99th percentile of the lateness of ticks"),
+            Axis::new("lateness", "µs"),
             sizes,
             [
                 ("none active", |size| size.quiet.late_us[0]),
@@ -104,13 +105,13 @@ fn bench_figures(sizes: &[SizeFigures]) -> [Figure; 7] {
             ],
         ),
         figure_over_cells(
-            ("replies", "Replies in time, 5 % active, at the highest rate that holds"),
+            ("replies", "Replies in time, 5 % active, at the highest rate that is met"),
             Axis::new("replies in time", "%").with_ends(0.0, 100.0),
             sizes,
             [("", |size| size.active.in_time_share() * 100.0)],
         ),
         figure_over_cells(
-            ("rate", "The highest rate that holds, or the lowest tried"),
+            ("rate", "Highest rate that is met, or the lowest rate tried"),
             Axis::new("rate", "Hz"),
             sizes,
             [("", |size| size.hz)],
@@ -122,7 +123,7 @@ fn tick_time_figure(over: &TickTimes) -> Figure {
     let micros = |place: fn(&[f64; 3]) -> f64| {
         over.points.iter().map(|point| (point[0], place(point) * 1e-3)).collect::<Vec<_>>()
     };
-    let title = "Ticks over cells, all active, on as many buses";
+    let title = "Time of a tick by number of cells, all active, on the same number of buses";
     Figure::new(
         "scale-loop",
         title,
@@ -141,7 +142,8 @@ fn largest_bench_findings(size: &SizeFigures) -> Vec<Finding> {
     let at = format!("replies in time at {} Hz, 5 % active", format_number(*hz));
     let bar = format!("at least {} %, none missing for no known reason", MIN_IN_TIME_SHARE * 100.0);
     vec![
-        Finding::new_unrated(of("from the start to the first joints"), (*start_s, "s")).at_most(MAX_START_S),
+        Finding::new_unrated(of("time from the start to the first joints"), (*start_s, "s"))
+            .at_most(MAX_START_S),
         Finding::new_unrated(of(&at), (active.in_time_share() * 100.0, "%")).with_requirement(bar, *holds),
         Finding::new_unrated(
             of("replies and packets missing for no known reason"),
@@ -184,7 +186,7 @@ fn bench_table(sizes: &[SizeFigures]) -> Table {
         [
             cells.to_string(),
             buses.to_string(),
-            format!("{}{}", format_number(*hz), if *holds { "" } else { " (does not hold)" }),
+            format!("{}{}", format_number(*hz), if *holds { "" } else { " (not met)" }),
             both(|figures| figures.start_s),
             both(|figures| figures.cores.iter().sum()),
             both(|figures| figures.memory_mb[0]),
@@ -201,9 +203,9 @@ fn bench_table(sizes: &[SizeFigures]) -> Table {
         "processor, cores",
         "gateway, MB",
         "tick, µs",
-        "99 % of ticks late by, µs",
+        "99th percentile of lateness, µs",
         "replies in time, 5 % active",
     ];
-    let title = "Benches over their cells; of two numbers the first with none active, the second with 5 %";
+    let title = "Benches by number of cells; of two numbers, the first is with none active, the second with 5 % active";
     Table::new(title, head, sizes.iter().map(row))
 }

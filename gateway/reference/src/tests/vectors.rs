@@ -150,16 +150,18 @@ fn torques() -> Vec<Value> {
 
 /// Returns the text of `vectors.json`, with each element of an array on its own line.
 fn file() -> String {
-    let about = "Frames as candump and cansend write them; docs/reference/protocol.md says what they mean, and cell.md what a cell \
-                 does. packets: frames and what they say. refused: frames that are none. reassembly: segments in their order, and \
-                 what each comes to. session: a cell is configured and pressed. refusals: each a write to the cell of session after \
-                 its commit, out of test mode, and the answer (of parameter 127: to a commit after that write). exchanges: a start, \
-                 then all frames that one cell receives (bus) and has to send (cell); the title names the requirements, cell.md the \
-                 options that it needs; flash is empty, or what session commits. wires: messages over wires. All \
-                 other numbers are words as they stand in packets. forces: parameter 3, sensors page 0, F_z with 16 fraction bits, \
-                 J, torque. sums: epochs of one cell, whose own J and F_z, children's sums and sum. torques: parameters 1, 16 to 21, \
-                 2, 3, joints, sensors page 0, and what the cell of this project answers; another cell's jacobian may differ from \
-                 jacobian_exact as J-3 allows, and its torque accordingly.";
+    let about = "Frames are in the format of candump and cansend; docs/reference/protocol.md defines their meaning, \
+                 and docs/reference/cell.md the behaviour of a cell. packets: frames and their meaning. refused: \
+                 frames that are not valid packets. reassembly: segments in the order of their arrival, and the \
+                 result of each. session: a cell is configured and pressed. refusals: each is a write to the cell of \
+                 session after its commit, out of test mode, and the answer (for parameter 127: the answer to a \
+                 commit after that write). exchanges: a start, then all frames that one cell receives (bus) and has \
+                 to send (cell); the title names the requirements, and cell.md lists the options that it needs; flash \
+                 is empty, or has the parameters that session commits. wires: messages over wires. All other numbers \
+                 are words as in packets. forces: parameter 3, sensors page 0, F_z with 16 fraction bits, J, torque. \
+                 sums: epochs of one cell, with its own J and F_z, the sums of its children, and its sum. torques: \
+                 parameters 1, 16 to 21, 2, 3, joints, sensors page 0, and the answer of this project's cell; the \
+                 jacobian of another cell may differ from jacobian_exact as J-3 allows, and its torque accordingly.";
     let parts = [
         ("packets", PACKETS.iter().flat_map(|log| convert_log(log, packet)).collect()),
         ("refused", convert_log(REFUSED, refused)),

@@ -59,33 +59,34 @@ fn other_faults_have_their_line_and_what_to_do() {
         (
             "</robot>",
             "",
-            "t.urdf:4: it ends before its outermost element does: it is cut off; copy or download it again",
+            "t.urdf:4: the root element is not closed, so the file is incomplete: copy or download it again",
         ),
         (
             "<link name=\"b\"/>",
             "\n<link name=\"b&c\"/>",
-            "t.urdf:4: a & that begins no entity of XML: write &amp; for it",
+            "t.urdf:4: the & does not begin an XML entity: write &amp; instead",
         ),
         (
             "<robot",
             "<!-- x -->\n<?xml version=\"1.0\"?><robot",
-            "t.urdf:3: an XML declaration that is not at the beginning of the file: delete it",
+            "t.urdf:3: the XML declaration is not at the beginning of the file: delete it",
         ),
         ("</joint>", "</link>", "t.urdf:4: </link> does not close the open <joint>: correct one of the two"),
         ("type=", "name=", "t.urdf:4: an element has the attribute name twice: delete one"),
         (
             "<robot",
             "<!DOCTYPE r [<!ENTITY a \"1\">]>\n<robot",
-            "t.urdf:2: a <!DOCTYPE with definitions, which are not read: delete it, and write what its entities stand for in their places",
+            "t.urdf:2: the <!DOCTYPE contains definitions, which this program does not read: delete it, and \
+             replace its entities by their values",
         ),
     ] {
         assert_eq!(refused(&good.replacen(from, to, 1)), expected);
     }
     // Blank lines before the first tag count.
-    assert!(refused("\n\n<robot>\n&</robot>").starts_with("t.urdf:4: a & "));
+    assert!(refused("\n\n<robot>\n&</robot>").starts_with("t.urdf:4: the & "));
     // An element with many attributes is refused before the parser compares each of them with all others.
     let many: String = (0..50_000).map(|number| format!(" a{number}=''")).collect();
-    let expected = "t.urdf:3: element link has 50001 attributes, and at most 256 are read: delete some";
+    let expected = "t.urdf:3: element link has 50001 attributes, but at most 256 are allowed: delete some";
     assert_eq!(refused(&wrap(&format!("<link name=\"a\"{many}/>"))), expected);
 }
 
@@ -94,13 +95,14 @@ fn a_file_of_another_kind_is_named() {
     let lfs = "version https://git-lfs.github.com/spec/v1\noid sha256:12\nsize 3\n";
     assert_eq!(
         refused(lfs),
-        "t.urdf: a Git LFS pointer to a file, not the file: fetch it with `git lfs pull`"
+        "t.urdf: this is a Git LFS pointer to a file, not the file: fetch it with `git lfs pull`"
     );
-    let page = "t.urdf: a web page (HTML), as a server sends for a wrong address: download the file itself";
+    let page = "t.urdf: this is a web page (HTML), which a server may send if the address is wrong: download the file itself";
     assert_eq!(refused("<!DOCTYPE html>\n<html lang=en><p>404"), page);
     assert_eq!(
         refused(&wrap(&format!("{ARM}<<<<<<< HEAD\n=======\n>>>>>>> main\n"))),
-        "t.urdf:5: a merge conflict of git: keep one side, and delete the lines <<<<<<<, =======, >>>>>>> and the other side"
+        "t.urdf:5: this is a merge conflict of git: keep one side, and delete the other side and the lines <<<<<<<, \
+         ======= and >>>>>>>"
     );
     let other = |element: &str, kind: &str| {
         let expected = format!(
@@ -108,8 +110,8 @@ fn a_file_of_another_kind_is_named() {
         );
         assert_eq!(refused(&format!("<{element}/>")), expected);
     };
-    other("sdf", " (an SDF file, of Gazebo)");
-    other("mujoco", " (an MJCF file, of MuJoCo)");
+    other("sdf", " (an SDF file of Gazebo)");
+    other("mujoco", " (an MJCF file of MuJoCo)");
     other("COLLADA", " (a COLLADA mesh)");
     other("x", "");
     let srdf =
@@ -152,7 +154,7 @@ fn utf_16_is_refused_as_by_ros_with_a_command_that_repairs_it() {
         assert_eq!(
             decode_text("t.urdf", &wide).unwrap_err().to_string(),
             format!(
-                "t.urdf: it is UTF-16, which ROS does not read either: save it as UTF-8, for example with `iconv -f {name} -t utf-8 FILE > NEW`"
+                "t.urdf: the file is UTF-16, which ROS cannot read either: save it as UTF-8, for example with `iconv -f {name} -t utf-8 FILE > NEW`"
             )
         );
     }
@@ -185,21 +187,21 @@ fn a_faulty_shape_is_an_error_when_it_is_used() {
     for (shape, expected) in [
         (
             "<geometry><mesh filename=\"a.stl\" scale=\"0.001\"/></geometry>",
-            "scale = \"0.001\": three factors, as in \"0.001 0.001 0.001\"",
+            "scale = \"0.001\": must be three factors, as in \"0.001 0.001 0.001\"",
         ),
         (
             "<geometry><mesh filename=\"a.stl\" scale=\"1 1 1 1\"/></geometry>",
-            "scale = \"1 1 1 1\": three factors",
+            "scale = \"1 1 1 1\": must be three factors",
         ),
         ("<geometry><mesh/></geometry>", "has no filename: add it"),
         ("<geometry><mesh filename=\"\"/></geometry>", "has no filename: add it"),
         ("<geometry><mesh filename=\"$(find p)/a.stl\"/></geometry>", "expression $(find p) is not expanded"),
         ("<geometry><box/></geometry>", "has no size: add it"),
-        ("<geometry><box size=\"1 2\"/></geometry>", "size = \"1 2\": three lengths in m"),
+        ("<geometry><box size=\"1 2\"/></geometry>", "size = \"1 2\": must be three lengths in m"),
         ("<geometry><sphere/></geometry>", "has no radius: add it"),
         (
             "<origin xyz=\"1, 2, 3\"/><geometry><sphere radius=\"1\"/></geometry>",
-            "three lengths in m; blanks between them, no commas",
+            "three lengths in m, separated by blanks, not commas",
         ),
     ] {
         for element in ["visual", "collision"] {

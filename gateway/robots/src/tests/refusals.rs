@@ -37,7 +37,8 @@ fn files_that_are_no_urdf() {
     );
     assert_eq!(
         parse("<sdf/>"),
-        "t.urdf:1: the outermost element is \"sdf\" (an SDF file, of Gazebo); a URDF has `robot`: name the robot's URDF"
+        "t.urdf:1: the outermost element is \"sdf\" (an SDF file of Gazebo); a URDF has `robot`: name the \
+         robot's URDF"
     );
     assert_eq!(parse("<robot/>"), "t.urdf:1: the robot has no links; a URDF has at least one");
     // Lines are those of the file, whatever stands before the first tag.
@@ -64,28 +65,28 @@ fn xacro_is_refused_where_it_was_not_run() {
 #[test]
 fn values_that_are_not_allowed() {
     let value = |inner: &str| parse(&joined("revolute", inner));
-    let triple = "t.urdf:5: joint \"j\": xyz = \"1 2\": three lengths in m";
+    let triple = "t.urdf:5: joint \"j\": xyz = \"1 2\": must be three lengths in m";
     assert_eq!(value("<origin xyz=\"1 2\"/>"), triple);
     assert_eq!(
         value("<origin rpy=\"0 0 inf\"/>"),
-        "t.urdf:5: joint \"j\": rpy = \"0 0 inf\": three angles in rad"
+        "t.urdf:5: joint \"j\": rpy = \"0 0 inf\": must be three angles in rad"
     );
     assert_eq!(
         value("<axis xyz=\"0 0 0\"/>"),
-        "t.urdf:5: joint \"j\": xyz = \"0 0 0\": three numbers, not all zero"
+        "t.urdf:5: joint \"j\": xyz = \"0 0 0\": must be three numbers, not all zero"
     );
-    assert!(value("<axis xyz=\"1e300 0 0\"/>").ends_with("three numbers, not all zero"));
+    assert!(value("<axis xyz=\"1e300 0 0\"/>").ends_with("must be three numbers, not all zero"));
     assert_eq!(
         value("<limit lower=\"-1,5\"/>"),
-        "t.urdf:5: joint \"j\": lower = \"-1,5\": one number, with a point"
+        "t.urdf:5: joint \"j\": lower = \"-1,5\": must be one number with a decimal point"
     );
     assert_eq!(
         value("<origin quat_xyzw=\"0 0 0 1\"/>"),
-        "t.urdf:5: joint \"j\": quat_xyzw = \"0 0 0 1\": write it as rpy, the angles in rad"
+        "t.urdf:5: joint \"j\": quat_xyzw = \"0 0 0 1\": must be given as rpy, the angles in rad"
     );
     assert_eq!(
         parse(&joined("hinge", "")),
-        "t.urdf:5: joint \"j\": type = \"hinge\": revolute, continuous, prismatic, fixed, floating or planar"
+        "t.urdf:5: joint \"j\": type = \"hinge\": must be revolute, continuous, prismatic, fixed, floating or planar"
     );
     assert_eq!(parse(&wrap("<link/>")), "t.urdf:3: link has no name: add it");
     assert_eq!(
@@ -105,15 +106,15 @@ fn links_that_are_no_tree() {
     let tree = |joints: &[String]| parse(&wrap(&(three.to_owned() + &joints.concat())));
     assert_eq!(
         parse(&wrap("<link name=\"a\"/>\n<link name=\"a\"/>\n")),
-        "t.urdf:4: two links are named \"a\"; each needs a name of its own: rename one"
+        "t.urdf:4: two links are named \"a\"; each needs a unique name: rename one"
     );
     assert_eq!(
         tree(&[joint("j", "a", "b"), joint("j", "a", "c")]),
-        "t.urdf:5: two joints are named \"j\"; each needs a name of its own: rename one"
+        "t.urdf:5: two joints are named \"j\"; each needs a unique name: rename one"
     );
     assert_eq!(
         tree(&[joint("j", "a", "d")]),
-        "t.urdf:4: joint \"j\" has the child \"d\", but there is no such link; the nearest are \"a\", \"b\" or \"c\""
+        "t.urdf:4: joint \"j\" has the child \"d\", but there is no such link; similar names: \"a\", \"b\" or \"c\""
     );
     assert_eq!(
         tree(&[joint("j", "d", "a")]).split(',').next().unwrap(),
@@ -121,11 +122,11 @@ fn links_that_are_no_tree() {
     );
     assert_eq!(
         tree(&[joint("j", "a", "b")]),
-        "t.urdf: the links \"a\" and \"c\" have no parent; one root is allowed: connect them with a fixed joint"
+        "t.urdf: the links \"a\" and \"c\" have no parent; only one root is allowed: connect them with a fixed joint"
     );
     assert_eq!(
         tree(&[joint("j", "a", "c"), joint("k", "b", "c")]),
-        "t.urdf:5: link \"c\" is the child of the joints \"j\" and \"k\"; one is allowed: remove the other"
+        "t.urdf:5: link \"c\" is the child of the joints \"j\" and \"k\"; only one is allowed: remove the other"
     );
     let cycle = "is its own ancestor; links must form a tree: remove a joint of the cycle";
     assert_eq!(tree(&[joint("j", "b", "c"), joint("k", "c", "b")]), format!("t.urdf: link \"b\" {cycle}"));
@@ -171,7 +172,8 @@ fn joints_that_a_chain_cannot_have() {
     }
     assert_eq!(
         chain(&joined("fixed", ""), "b"),
-        "t.urdf: no joint moves between \"a\" and \"b\"; 1 to 14 are needed: choose a tip farther out, or a root nearer to the base"
+        "t.urdf: no joint moves between \"a\" and \"b\", but a chain needs 1 to 14 moving joints: choose a tip \
+         farther out, or a root nearer to the base"
     );
     assert_eq!(chain(&joined("fixed", ""), "a"), chain(&joined("fixed", ""), "b").replace("\"b\"", "\"a\""));
 }
@@ -182,12 +184,13 @@ fn chains_that_are_not_there() {
     let xml = robot(&joints);
     assert_eq!(
         chain(&xml, "l15"),
-        "t.urdf: 15 joints move between \"l0\" and \"l15\"; at most 14 are possible: choose a root or a tip nearer to the other"
+        "t.urdf: 15 joints move between \"l0\" and \"l15\"; the maximum is 14: choose a root and a tip that are \
+         nearer to each other"
     );
     assert_eq!(good(&xml, "l14").joints.len(), 14);
     assert_eq!(
         chain(&xml, "L2x"),
-        "t.urdf: there is no link \"L2x\"; the nearest are \"l2\", \"l0\" or \"l1\""
+        "t.urdf: there is no link \"L2x\"; similar names: \"l2\", \"l0\" or \"l1\""
     );
     let urdf = Urdf::parse("t.urdf", &xml).unwrap();
     assert_eq!(
@@ -203,14 +206,14 @@ fn chains_that_are_too_long() {
         |x: f64| robot(&[TestJoint::hinge([0.0; 3], [0.0; 3]), TestJoint::hinge([x, 0.0, 0.0], [0.0; 3])]);
     assert_eq!(
         chain(&long(2.5), "l2"),
-        "t.urdf: row 1, to joint \"j2\": a = 2.500 m; [-2, 2) m is possible: choose a tip nearer to the root"
+        "t.urdf: row 1, to joint \"j2\": a = 2.500 m; it must be in [-2, 2) m: choose a tip nearer to the root"
     );
     assert_eq!(good(&long(1.99), "l2").rows.len(), 2);
     let slide =
         |upper: f64| robot(&[TestJoint { limits: [0.0, upper], ..TestJoint::slide([0.0; 3], [0.0; 3]) }]);
     assert_eq!(
         chain(&slide(2.25), "l1"),
-        "t.urdf: row 1, to link \"l1\": d with the joint at its limit = 2.250 m; [-2, 2) m is possible: choose a root behind that joint, or narrow its limits"
+        "t.urdf: row 1, to link \"l1\": d with the joint at its limit = 2.250 m; it must be in [-2, 2) m: choose a root behind that joint, or narrow its limits"
     );
     assert_eq!(good(&slide(1.75), "l1").rows.len(), 1);
     let reaching = |x: f64| {
@@ -219,7 +222,8 @@ fn chains_that_are_too_long() {
     };
     assert_eq!(
         chain(&reaching(0.8), "l4"),
-        "t.urdf: link \"l4\" can be up to 2.100 m from a frame of the rows below it, if all joints turn freely; less than 1.999 m is possible: choose a tip or a root nearer to the other"
+        "t.urdf: link \"l4\" can be up to 2.100 m from the frame of a preceding row, if all joints turn freely; \
+         it must be less than 1.999 m: choose a root and a tip that are nearer to each other"
     );
     assert_eq!(good(&reaching(0.8), "l3").rows.len(), 3);
     assert_eq!(good(&reaching(0.74), "l4").rows.len(), 3);
@@ -244,10 +248,7 @@ fn what_the_skins_check_refuses_has_the_line_of_its_cell() {
         ..CellOnLink::default()
     };
     let nodes = [cell(2, None, Some(1)), cell(5, None, Some(255))];
-    assert_eq!(
-        refused(&nodes),
-        "line 5: node = 255: a cell's node is 1 to 254; further cells need another bus"
-    );
+    assert_eq!(refused(&nodes), "line 5: node = 255: must be 1 to 254; further cells need another bus");
     let buses: Vec<_> = (2..67).map(|line| cell(line, Some(format!("b{line}")), None)).collect();
-    assert_eq!(refused(&buses), "bus = 65 buses: a skin has at most 64 buses");
+    assert_eq!(refused(&buses), "bus = 65 buses: a skin can have at most 64 buses");
 }

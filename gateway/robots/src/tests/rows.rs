@@ -285,7 +285,7 @@ fn links_are_where_the_file_has_them() {
         why("nail"),
         r#"t.urdf: link "nail" is moved by joint "grip", which is not between "l0" and "l7": choose another tip, or a link of the chain"#
     );
-    assert_eq!(why("l8"), r#"t.urdf: there is no link "l8"; the nearest are "l2", "l3" or "l4""#);
+    assert_eq!(why("l8"), r#"t.urdf: there is no link "l8"; similar names: "l2", "l3" or "l4""#);
     let part = urdf.chain(Some("l4"), "l6").unwrap();
     let above = part.link("cover").unwrap_err().to_string();
     assert_eq!(above, r#"t.urdf: link "cover" is not below the chain's root "l4": choose a root above it"#);

@@ -120,5 +120,5 @@ normal = [0.0, 1.0, 0.0]
     let named = Urdf::parse("robot.urdf", &text.xml).unwrap();
     assert_eq!((named.links().count(), text.links[1][0].as_str()), (urdf.links().count(), "le_ft_2_link1"));
     let error = urdf.link_poses(&["d"]).unwrap_err().to_string();
-    assert!(error.starts_with("robot.urdf: there is no moving joint \"d\"; the nearest are "), "{error}");
+    assert!(error.starts_with("robot.urdf: there is no moving joint \"d\"; similar names: "), "{error}");
 }

@@ -104,12 +104,13 @@ impl<'a> UrdfParser<'a> {
         let geometry = self.child(node, "geometry").and_then(|node| node.first_element_child());
         let Some(node) = geometry else { return Ok(None) };
         let size = |attribute| {
-            let [size] = self.parse_numbers(node, thing, attribute, "a length in m")?.ok_or_else(|| {
-                self.error_at_node(
-                    node,
-                    RobotProblem::Missing { thing: thing.to_owned(), missing: attribute },
-                )
-            })?;
+            let [size] =
+                self.parse_numbers(node, thing, attribute, "must be a length in m")?.ok_or_else(|| {
+                    self.error_at_node(
+                        node,
+                        RobotProblem::Missing { thing: thing.to_owned(), missing: attribute },
+                    )
+                })?;
             Ok(size)
         };
         let geometry = match node.tag_name().name() {
@@ -118,12 +119,12 @@ impl<'a> UrdfParser<'a> {
                 if let Some(expression) = xacro_expression(&path) {
                     return Err(self.xacro_error(node, format!("expression {expression}")));
                 }
-                let allowed = "three factors, as in \"0.001 0.001 0.001\"";
+                let allowed = "must be three factors, as in \"0.001 0.001 0.001\"";
                 let scale = self.parse_numbers(node, thing, "scale", allowed)?.unwrap_or([1.0; 3]);
                 Geometry::Mesh { path, scale }
             }
             "box" => {
-                let size = self.parse_numbers(node, thing, "size", "three lengths in m")?;
+                let size = self.parse_numbers(node, thing, "size", "must be three lengths in m")?;
                 let missing = || RobotProblem::Missing { thing: thing.to_owned(), missing: "size" };
                 Geometry::Box { size: size.ok_or_else(|| self.error_at_node(node, missing()))? }
             }
@@ -145,7 +146,7 @@ impl<'a> UrdfParser<'a> {
             "floating" => UrdfJointKind::Floating,
             "planar" => UrdfJointKind::Planar,
             other => {
-                let allowed = "revolute, continuous, prismatic, fixed, floating or planar";
+                let allowed = "must be revolute, continuous, prismatic, fixed, floating or planar";
                 return Err(self.value_error(node, &thing, "type", other, allowed));
             }
         };
@@ -190,7 +191,7 @@ impl<'a> UrdfParser<'a> {
             }
         }
         let Some(node) = self.child(node, "axis") else { return Ok(Vector3::x_axis()) };
-        let allowed = "three numbers, not all zero";
+        let allowed = "must be three numbers, not all zero";
         let axis = self.parse_numbers(node, thing, "xyz", allowed)?.unwrap_or([1.0, 0.0, 0.0]);
         let axis = Vector3::from(axis);
         Unit::try_new(axis, MIN_AXIS_LENGTH).filter(|_| axis.norm().is_finite()).ok_or_else(|| {
@@ -213,12 +214,13 @@ impl<'a> UrdfParser<'a> {
                 thing,
                 "quat_xyzw",
                 got,
-                "write it as rpy, the angles in rad",
+                "must be given as rpy, the angles in rad",
             ));
         }
-        let [x, y, z] = self.parse_numbers(node, thing, "xyz", "three lengths in m")?.unwrap_or_default();
+        let [x, y, z] =
+            self.parse_numbers(node, thing, "xyz", "must be three lengths in m")?.unwrap_or_default();
         let [roll, pitch, yaw] =
-            self.parse_numbers(node, thing, "rpy", "three angles in rad")?.unwrap_or_default();
+            self.parse_numbers(node, thing, "rpy", "must be three angles in rad")?.unwrap_or_default();
         let turn = UnitQuaternion::from_euler_angles(roll, pitch, yaw);
         Ok(Isometry3::from_parts(Translation3::new(x, y, z), turn))
     }
@@ -270,7 +272,8 @@ impl<'a> UrdfParser<'a> {
     ) -> Result<Option<f64>, RobotError> {
         let Some(text) = node.attribute(attribute) else { return Ok(None) };
         let number = text.trim().parse().ok().filter(|it: &f64| !it.is_nan());
-        let allowed = if text.contains(',') { "one number, with a point" } else { "a number" };
+        let allowed =
+            if text.contains(',') { "must be one number with a decimal point" } else { "must be a number" };
         number.map(Some).ok_or_else(|| self.value_error(node, thing, attribute, text, allowed))
     }
 
@@ -287,8 +290,8 @@ impl<'a> UrdfParser<'a> {
         if let Some(expression) = xacro_expression(value) {
             return self.xacro_error(node, format!("expression {expression}"));
         }
-        let commas = if value.contains([',', ';']) && allowed.starts_with("three") {
-            "; blanks between them, no commas"
+        let commas = if value.contains([',', ';']) && allowed.starts_with("must be three") {
+            ", separated by blanks, not commas"
         } else {
             ""
         };

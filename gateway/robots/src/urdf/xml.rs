@@ -20,7 +20,8 @@ pub fn decode_text<'a>(file: &str, bytes: &'a [u8]) -> Result<Cow<'a, str>, Robo
     refuse_foreign_format(file, bytes)?;
     if let Some(name) = utf16_encoding_name(bytes) {
         let what = format!(
-            "it is UTF-16, which ROS does not read either: save it as UTF-8, for example with `iconv -f {name} -t utf-8 FILE > NEW`"
+            "the file is UTF-16, which ROS cannot read either: save it as UTF-8, for example with \
+             `iconv -f {name} -t utf-8 FILE > NEW`"
         );
         return Err(xml_error(file, XmlFault { line: None, what }));
     }
@@ -56,7 +57,7 @@ pub(super) fn parse_document<'a>(
 fn refuse_foreign_format(file: &str, bytes: &[u8]) -> Result<(), RobotError> {
     let Some(UnexpectedFileKind { line, what, hint }) = detect_unexpected_file(bytes) else { return Ok(()) };
     let line = line.and_then(|line| u32::try_from(line).ok());
-    Err(RobotError::new(file, line, RobotProblem::Xml(format!("{what}: {hint}"))))
+    Err(RobotError::new(file, line, RobotProblem::Xml(format!("this is {what}: {hint}"))))
 }
 
 fn xml_error(file: &str, XmlFault { line, what }: XmlFault) -> RobotError {
@@ -70,16 +71,16 @@ fn description(reason: &Error) -> String {
     let plain = |what: &str| what.to_owned();
     match reason {
         Error::MalformedEntityReference(_) | Error::UnknownEntityReference(..) => {
-            plain("a & that begins no entity of XML: write &amp; for it")
+            plain("the & does not begin an XML entity: write &amp; instead")
         }
         Error::UnexpectedDeclaration(_) => {
-            plain("an XML declaration that is not at the beginning of the file: delete it")
+            plain("the XML declaration is not at the beginning of the file: delete it")
         }
         Error::UnexpectedCloseTag(expected, found, _) => {
             format!("</{found}> does not close the open <{expected}>: correct one of the two")
         }
         Error::UnclosedRootNode | Error::UnexpectedEndOfStream | Error::NoRootNode => {
-            plain("it ends before its outermost element does: it is cut off; copy or download it again")
+            plain("the root element is not closed, so the file is incomplete: copy or download it again")
         }
         Error::DuplicatedAttribute(name, _) => {
             format!("an element has the attribute {name} twice: delete one")
@@ -87,9 +88,9 @@ fn description(reason: &Error) -> String {
         Error::NonXmlChar(letter, _) => {
             format!("the character U+{:04X} cannot be in XML: delete it", u32::from(*letter))
         }
-        Error::InvalidAttributeValue(_) => plain("a < in an attribute's value: write &lt; for it"),
-        Error::InvalidCharacterData(_) => plain("]]> in a text: write ]]&gt; for it"),
-        Error::InvalidComment(_) => plain("a comment with -- in it, or that ends with -: delete it"),
+        Error::InvalidAttributeValue(_) => plain("the value of an attribute contains <: write &lt; instead"),
+        Error::InvalidCharacterData(_) => plain("a text contains ]]>: write ]]&gt; instead"),
+        Error::InvalidComment(_) => plain("a comment contains -- or ends with -: delete the comment"),
         other => {
             let (text, place) = (other.to_string(), format!(" at {}", other.pos()));
             let text = text.strip_suffix(place.as_str()).unwrap_or(&text);

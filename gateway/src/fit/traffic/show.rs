@@ -85,7 +85,7 @@ fn bus_rows(rows: &mut KeyValueTable, bus: &BusShadow, report: &ShadowReport) {
     }
     if bit_error_rate > 0.0 {
         let each = format!("bit error rate {bit_error_rate:e}");
-        rows.add_row("damaged, and sent again", format!("{} attempts", bus.counts.damaged), each);
+        rows.add_row("damaged, and retransmitted", format!("{} attempts", bus.counts.damaged), each);
     }
     add_bench_traffic_row(rows, bus);
     let of_all =
@@ -93,44 +93,44 @@ fn bus_rows(rows: &mut KeyValueTable, bus: &BusShadow, report: &ShadowReport) {
     rows.add_row_unless_zero(
         "left out: error frames",
         bus.counts.error_frames,
-        "of a driver, never on a wire",
+        "reported by a driver, not sent on the bus",
     );
     rows.add_row_unless_zero(
         "out of order, and sorted",
         bus.counts.out_of_order,
         of_all(bus.counts.out_of_order),
     );
-    rows.add_row_unless_zero("  too far for that", bus.counts.too_late_to_sort, "they count at a later time");
-    rows.add_row_unless_zero("never sent", bus.counts.no_room, "4 million frames waited already");
+    rows.add_row_unless_zero("  too late to sort", bus.counts.too_late_to_sort, "counted at a later time");
+    rows.add_row_unless_zero("never sent", bus.counts.no_room, "because 4 million frames already waited");
 }
 
 /// Adds rows on whether the traffic fits on the bus, in the worst case and in this run.
 fn add_fit_rows(rows: &mut KeyValueTable, bus: &BusShadow, has_times: bool) {
     match (&bus.worst_case, &bus.answering) {
         (Some(worst), _) => rows.add_row(worst.case_name(), worst.table_value(), worst.cells),
-        (None, Some(_)) => rows.add_row("worst case", "?", "needs a skin with this bus: --skin"),
+        (None, Some(_)) => rows.add_row("worst case", "?", "needs a skin with this bus: use --skin"),
         (None, None) => {}
     }
     match &bus.this_run {
         Some(run) => rows.add_row(run.case_name(), run.table_value(), run.cells),
-        None if !has_times => rows.add_row("this run", "?", "its frames have no times"),
-        None if bus.duration_s == 0.0 => rows.add_row("this run", "?", "its frames have one time"),
-        None => rows.add_row("this run", "no joints in it", ""),
+        None if !has_times => rows.add_row("this run", "?", "the frames have no time stamps"),
+        None if bus.duration_s == 0.0 => rows.add_row("this run", "?", "all frames have the same time stamp"),
+        None => rows.add_row("this run", "no joints messages", ""),
     }
     match bus.answering {
         Some(AnsweringCounts { epochs, epochs_halted: 0, mean: Some(mean), .. }) => {
             rows.add_row(
                 "  cells that answered",
                 format!("{mean:.1} on average"),
-                format!("{epochs} joints"),
+                format!("{epochs} joints messages"),
             );
         }
         Some(AnsweringCounts { epochs, epochs_halted, mean: Some(mean), .. }) => {
-            let beside = format!("{epochs} joints; {epochs_halted} more while halted are left out");
+            let beside = format!("{epochs} joints messages, without {epochs_halted} sent while halted");
             rows.add_row("  cells that answered", format!("{mean:.1} on average"), beside);
         }
         Some(AnsweringCounts { epochs_halted: halted @ 1.., mean: None, .. }) => {
-            rows.add_row("  cells that answered", "halted all the time", format!("{halted} joints"));
+            rows.add_row("  cells that answered", "halted all the time", format!("{halted} joints messages"));
         }
         _ => {}
     }
@@ -138,9 +138,9 @@ fn add_fit_rows(rows: &mut KeyValueTable, bus: &BusShadow, has_times: bool) {
 
 fn add_operation_rows(rows: &mut KeyValueTable, bus: &BusShadow) {
     add_load_rows(rows, bus, &bus.load, ("average load", &format!("{:.3} s in operation", bus.operation_s)));
-    rows.add_row("  bus taken", format_share(bus.load.busy), "");
+    rows.add_row("  bus busy", format_share(bus.load.busy), "");
     add_busy_stretch_row(rows, bus, &bus.stretches);
-    rows.add_row("delay, µs", "50 % / 99 % / max", "until it is sent");
+    rows.add_row("delay, µs", "50 % / 99 % / max", "from request to end of frame");
     rows.add_row("  all frames", format_delays(&bus.delay_us), format!("{} frames", bus.delay_us.count));
     for kind in &bus.kinds {
         let (name, delay) = (kind.kind, &kind.delay_us);
@@ -149,7 +149,7 @@ fn add_operation_rows(rows: &mut KeyValueTable, bus: &BusShadow) {
     if let Some(replies) = &bus.replies {
         add_answer_rows(rows, replies);
     }
-    rows.add_row("most that waited", format!("{} frames", bus.queue.value), format_peak_time(bus, bus.queue));
+    rows.add_row("longest queue", format!("{} frames", bus.queue.value), format_peak_time(bus, bus.queue));
     if bus.queue_of_one.value > 0.0 {
         let of = format!("{} frames of {}", bus.queue_of_one.value, Identifier(bus.queue_of_one_id, false));
         rows.add_row("  of one identifier", of, format_peak_time(bus, bus.queue_of_one));
@@ -158,7 +158,7 @@ fn add_operation_rows(rows: &mut KeyValueTable, bus: &BusShadow) {
 
 /// Adds rows on the start-up, for which no limits apply.
 fn add_start_up_rows(rows: &mut KeyValueTable, bus: &BusShadow, start_up: &StartUpFigures) {
-    let beside = format!("{} frames in {:.3} s without joints", start_up.frames, start_up.duration_s);
+    let beside = format!("{} frames in {:.3} s, without joints", start_up.frames, start_up.duration_s);
     add_load_rows(rows, bus, &start_up.load, ("start-up: average load", &beside));
     add_busy_stretch_row(rows, bus, &start_up.stretches);
     rows.add_row("  delay, µs", format_delays(&start_up.delay_us), "50 % / 99 % / max");
@@ -193,7 +193,7 @@ fn add_busy_stretch_row(rows: &mut KeyValueTable, bus: &BusShadow, stretches: &B
     let longest = stretches.longest_s;
     let beside = format!("longest {:.1} ms, {}", 1e3 * longest.value, format_peak_time(bus, longest));
     let times = format!("{}, {:.3} s", count_with_noun(stretches.count, "time"), stretches.total_s);
-    rows.add_row("  no pause for 16 ms", times, beside);
+    rows.add_row("  busy at least 16 ms", times, beside);
 }
 
 fn format_share(share: Option<f64>) -> String {
@@ -204,7 +204,7 @@ fn add_answer_rows(rows: &mut KeyValueTable, replies: &ReplyStatistics) {
     let ReplyStatistics { count, late_before, late, late_when_ready, after_joints_us } = replies;
     rows.add_row("answers after joints, µs", format_delays(after_joints_us), "50 % / 99 % / max");
     let beside = [
-        Some("after the next joints".to_owned()),
+        Some("after the next joints message".to_owned()),
         (*late_when_ready > 0).then(|| format!("{late_when_ready} not caused by the bus")),
         (*late_before > 0).then(|| format!("{late_before} others were already late in the recording")),
     ];

@@ -23,7 +23,7 @@ pub(super) fn add_frame_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verb
             count_with_noun(sensors.touches, "touch"),
             count_with_noun(sensors.releases, "release"),
         ]);
-        rows.add_row("  sensors of a cell, Hz", format!("{min:.1} / {mean:.1} / {max:.1}"), touches);
+        rows.add_row("  sensor frames per cell, Hz", format!("{min:.1} / {mean:.1} / {max:.1}"), touches);
     }
     if is_verbose {
         rows.add_row("sent", counts_by_kind(&bus.sent), "");
@@ -36,19 +36,19 @@ pub(super) fn add_frame_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verb
 /// Adds rows on the packets from the cells, by what became of them.
 fn add_packet_rows(rows: &mut KeyValueTable, bus: &BusSummary, lost: u64) {
     let up = &bus.uplink;
-    rows.add_row("packets sent by cells", up.sent, "by their own count");
+    rows.add_row("packets sent by cells", up.sent, "according to their own counters");
     rows.add_row("  delivered", up.delivered, format!("{} rejected", up.rejected));
-    rows.add_row_unless_zero("  for other cells", up.unheard, "sums that the gateway does not take");
+    rows.add_row_unless_zero("  for other cells", up.unheard, "sums that the gateway does not receive");
     let reasons = [
         (up.dropped, "dropped by the bus"),
-        (up.backlog, "by the kernel's backlog"),
-        (up.outage, "with the bus"),
-        (up.hosts, "between hosts"),
+        (up.backlog, "dropped by the kernel's backlog"),
+        (up.outage, "lost with the bus"),
+        (up.hosts, "lost between hosts"),
     ];
     add_unexplained_row(rows, "  lost", lost, reasons_text(&reasons, up.unknown), up.unknown);
-    rows.add_row_unless_zero("  surplus", up.surplus, "");
-    rows.add_row_unless_zero("  of other senders", up.outsiders, "");
-    rows.add_row_unless_zero("  in doubt", up.in_doubt, "");
+    rows.add_row_unless_zero("  surplus", up.surplus, "more than the cells sent");
+    rows.add_row_unless_zero("  from other senders", up.outsiders, "");
+    rows.add_row_unless_zero("  in doubt", up.in_doubt, "sent just before a restart");
     rows.add_row_unless_zero("  after the last heartbeat", up.unsettled, "");
-    rows.add_row_unless_zero("  restarts of cells", up.restarts, "what they sent last is in doubt");
+    rows.add_row_unless_zero("  restarts of cells", up.restarts, "packets sent just before are in doubt");
 }

@@ -108,14 +108,15 @@ fn the_verdict_is_the_first_line() {
     let first = |summary: &Summary, columns| {
         format_summary(summary, TableStyle { columns, ..EIGHTY }).split('┌').next().unwrap().to_owned()
     };
-    let well = "all well: 253 cells, 575 of 575 epochs complete, 17772 replies in time, error 6.2e-5 Nm\n";
+    let well =
+        "all well: 253 cells, 575 of 575 epochs complete, 17772 replies in time, mean error 6.2e-5 Nm\n";
     assert_eq!(first(&demo(), Some(100)), well);
     assert_eq!(
         first(&demo(), Some(80)),
-        "all well: 253 cells, 575 of 575 epochs complete, 17772 replies in time, error\n  6.2e-5 Nm\n"
+        "all well: 253 cells, 575 of 575 epochs complete, 17772 replies in time, mean\n  error 6.2e-5 Nm\n"
     );
     let interrupted = Summary { interrupted: true, ..demo() }.with_verdict(None);
-    assert!(first(&interrupted, None).starts_with("all well until it was interrupted: 253 cells, "));
+    assert!(first(&interrupted, None).starts_with("all well until the run was interrupted: 253 cells, "));
     let look_at = [
         "first".to_owned(),
         "a second thing that is long enough to be broken when there is no more room".to_owned(),
@@ -123,11 +124,12 @@ fn the_verdict_is_the_first_line() {
     let wrong = Summary { verdict: Verdict { well: false, look_at: look_at.to_vec() }, ..demo() };
     assert_eq!(
         first(&wrong, Some(80)),
-        "look at: first\n         a second thing that is long enough to be broken when there is no more\n           room\n"
+        "problems: first\n          a second thing that is long enough to be broken when there is \
+         no more\n            room\n"
     );
     let many = Summary { verdict: Verdict { well: false, look_at: vec!["one".to_owned(); 9] }, ..demo() };
     let all = first(&many, Some(80));
-    assert!(all.lines().count() == 7 && all.ends_with("\n         and 3 more, with --verbose\n"), "{all}");
+    assert!(all.lines().count() == 7 && all.ends_with("\n          and 3 more: use --verbose\n"), "{all}");
     let verbose = format_summary(&many, TableStyle { is_verbose: true, ..EIGHTY });
     assert_eq!(verbose.lines().take_while(|line| line.ends_with("one")).count(), 9, "{verbose}");
 }
@@ -152,7 +154,7 @@ fn verbose_has_all_rows() {
     for row in usual {
         assert!(verbose.contains(row) && !brief.contains(row), "{row}\n{brief}\n{verbose}");
     }
-    for row in ["single cells", "the whole skin", "began late", "replies due", "recording", "vcan0"] {
+    for row in ["single cells", "the whole skin", "tick lateness", "replies due", "recording", "vcan0"] {
         assert!(verbose.contains(row) && brief.contains(row), "{row}\n{brief}\n{verbose}");
     }
     assert!(widest(&format_summary(&demo(), TableStyle { is_verbose: true, ..EIGHTY })) <= 80);
@@ -169,7 +171,7 @@ fn what_is_not_usual_is_shown_without_verbose() {
         (|it| it.accuracy.saturated = 1, "saturated words"),
         (
             |it| it.buses[0].outages = OutagesSummary { times: 1, lost_s: 0.5, at_end: false, ticks: 1 },
-            "1 tick without it",
+            "1 tick without the bus",
         ),
         (|it| it.buses[0].silent_cells = vec![7], "silent cells"),
         (|it| (it.buses[0].replies.in_time, it.buses[0].replies.late) = (17_771, 1), "1 late"),
@@ -183,7 +185,7 @@ fn what_is_not_usual_is_shown_without_verbose() {
         change(&mut summary);
         let columns = Some(110);
         let text = format_summary(&summary.with_verdict(None), TableStyle { columns, ..EIGHTY });
-        assert!(text.contains(shown) && text.starts_with("look at: "), "{shown}:\n{text}");
+        assert!(text.contains(shown) && text.starts_with("problems: "), "{shown}:\n{text}");
     }
 }
 

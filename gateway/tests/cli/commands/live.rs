@@ -48,9 +48,9 @@ impl Bench {
     fn dump(&self, arguments: &str) -> Child {
         let mut command = self.gateway(&format!("dump vcan0 {arguments}"));
         let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-        let mut line = [0; 18];
+        let mut line = [0; 28];
         child.stderr.as_mut().unwrap().read_exact(&mut line).unwrap();
-        assert_eq!(text(&line), "vcan0 is embedded\n");
+        assert_eq!(text(&line), "vcan0: bus of kind embedded\n");
         child
     }
 
@@ -163,8 +163,8 @@ fn a_cell_that_is_requested_answers_and_one_that_is_not_there_is_missed() {
             let nobody = says(&format!("frame stimulus --cell 250 {with}"));
             assert_eq!((nobody.0, nobody.1.as_str()), (Some(1), ""));
             let expected = format!(
-                "skinbus: no cell 250 sent anything on vcan0 for 1 s: `skinbus cells vcan0` lists the cells; the format \
-                 of the bus may be --format {}\n",
+                "skinbus: cell 250 sent nothing on vcan0 for 1 s: `skinbus cells vcan0` lists the cells; if the bus \
+                 has another frame format, use --format {}\n",
                 format.other_format().name()
             );
             assert_eq!(nobody.2, expected);
@@ -205,8 +205,7 @@ fn too_few_files_are_refused_before_anything_is_started() {
     command.args(["-c", "ulimit -n 12; exec \"$0\" run \"$1\" --duration 1 --bus-kind embedded"]);
     command.arg(env!("CARGO_BIN_EXE_skinbus")).arg(&skin).env("SKINBUS_DIR", parent.path().join("skinbus"));
     let Output { status, stderr, .. } = command.output().unwrap();
-    let said =
-        "skinbus: at most 12 files may be open at once, and this bench needs 33: run `ulimit -n 33` first\n";
+    let said = "skinbus: this bench needs 33 open files, but the limit is 12: run `ulimit -n 33` first\n";
     assert_eq!((status.code(), text(&stderr)), (Some(2), said));
 }
 
@@ -304,7 +303,7 @@ fn a_bus_that_comes_later_is_waited_for() {
     assert_eq!(dump("").wait().unwrap().code(), Some(2));
     for missing in ["missing.log", "folder/run"] {
         let Output { status, stderr, .. } = gateway(&format!("dump {missing} --wait")).output().unwrap();
-        let expected = format!("skinbus: --wait is only for buses, and there is no file {missing}\n");
+        let expected = format!("skinbus: --wait is only for buses, and the file {missing} does not exist\n");
         assert_eq!((status.code(), text(&stderr)), (Some(2), expected.as_str()));
     }
     let mut waits = dump("--wait -n 1");
@@ -358,7 +357,7 @@ fn what_the_options_of_a_dump_leave_out_is_said() {
         ),
         (
             "vcan0 --bus vcan0 --cell vcan1:3",
-            "skinbus: vcan1:3 is not on a selected bus (vcan0): leave out one of the two filters\n",
+            "skinbus: vcan1:3 is not on a selected bus (vcan0): omit one of the two filters\n",
         ),
     ] {
         let Output { status, stderr, .. } = bench.gateway(&format!("dump {arguments}")).output().unwrap();
@@ -368,10 +367,10 @@ fn what_the_options_of_a_dump_leave_out_is_said() {
     std::fs::write(&log, "(1.000000) vcan0 003##500000000000000000000000000004782\n").unwrap();
     let log = log.display().to_string();
     for (arguments, expected) in
-        [("--bus vcan3", "no frame comes from vcan3"), ("--cell vcan3:1", "no frame comes from vcan3")]
+        [("--bus vcan3", "contains no frame of vcan3"), ("--cell vcan3:1", "contains no frame of vcan3")]
     {
         let Output { status, stdout, stderr } = gateway(&format!("dump {log} {arguments}")).output().unwrap();
-        let expected = format!("{log}: {expected}\n");
+        let expected = format!("{log} {expected}\n");
         assert_eq!((status.code(), text(&stdout), text(&stderr)), (Some(0), "", expected.as_str()));
     }
 }
@@ -435,7 +434,7 @@ fn a_dump_reports_lost_frames_though_its_bus_has_ended() {
     let said = text(&stderr);
     let missing = said.strip_prefix("vcan0: ").and_then(|said| {
         said.strip_suffix(
-            " frames are missing: they came faster than they were shown\n\
+            " frames are missing: they arrived faster than they were shown\n\
              skinbus: the embedded bus vcan0 was closed: its server ended\n",
         )
     });

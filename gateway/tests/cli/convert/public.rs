@@ -83,7 +83,7 @@ fn an_identifier_that_does_not_fit_is_named_and_no_frame() {
     let (code, out, said) = run(&folder, "convert id_needs_29_bits.mcap -");
     assert_eq!((code, out.as_str()), (Some(1), ""));
     assert!(said.contains("18F010FE does not fit an identifier of 11 bits: at most 7FF"), "{said}");
-    assert!(said.ends_with("skinbus: id_needs_29_bits.mcap: there is no frame in it\n"), "{said}");
+    assert!(said.ends_with("skinbus: id_needs_29_bits.mcap: it contains no frame\n"), "{said}");
 }
 
 #[test]
@@ -91,7 +91,10 @@ fn topics_with_one_frame_id_are_two_buses() {
     let folder = folder(&["two_buses_one_frame_id.mcap"]);
     let (code, out, said) = run(&folder, "fit two_buses_one_frame_id.mcap --nominal 500k");
     assert_eq!(code, Some(0), "{said}");
-    assert!(said.contains("topics have frames of one frame_id: each topic is a bus of its own"), "{said}");
+    assert!(
+        said.contains("several topics use the same frame_id: each topic is read as a bus of its own"),
+        "{said}"
+    );
     for (bus, load) in [("/can0/from_can_bus", "97.8 %: fits"), ("/can1/from_can_bus", "97.0 %: fits")] {
         assert!(out.contains(&format!("{bus} at classic 500k")) && out.contains(load), "{out}");
     }
@@ -183,7 +186,7 @@ fn a_name_that_was_changed_is_what_is_said() {
         (code, out.as_str()),
         (Some(0), "(1700000000.000000000) _/robot_one/can 123#0102030405060708\n")
     );
-    assert!(said.contains("1 frame has a bus that is written under another name"), "{said}");
+    assert!(said.contains("1 frame has a bus whose name was changed"), "{said}");
     assert!(!said.contains("direction"), "{said}");
 }
 
@@ -243,11 +246,11 @@ fn texts_of_other_programs_are_named_with_what_to_do() {
         ("kinds/asc_comment_first.asc", "a Vector ASC log", "asc2log -I FILE"),
         ("kinds/busmaster.log", "a BUSMASTER log", "export it as a candump log"),
         ("kinds/canhacker.trc", "a CANHacker trace", "export it as a candump log"),
-        ("kinds/cansend_frames.log", "a list of frames for cansend", "there are no times in it"),
-        ("kinds/cansend_script.log", "a list of frames for cansend", "there are no times in it"),
+        ("kinds/cansend_frames.log", "a list of frames for cansend", "its frames have no times"),
+        ("kinds/cansend_script.log", "a list of frames for cansend", "its frames have no times"),
         ("kinds/clx000.txt", "a CSS Electronics CLX000 log", "export it as a candump log"),
-        ("kinds/python_can_printer.txt", "what python-can prints", "can_logger -f"),
-        ("kinds/socketcand.txt", "what socketcand sends", "export it as a candump log"),
+        ("kinds/python_can_printer.txt", "output of python-can", "can_logger -f"),
+        ("kinds/socketcand.txt", "output of socketcand", "export it as a candump log"),
     ] {
         let folder = folder(&[file]);
         let name = file.strip_prefix("kinds/").unwrap();
@@ -277,17 +280,15 @@ fn a_capture_is_shown_and_another_text_is_named_as_dump_names_it() {
     ] {
         let said = folder.refuses(command, 1);
         assert!(
-            said.starts_with(
-                "skinbus: words.txt: there is no frame in 1000 lines; expected the output of candump"
-            ),
+            said.starts_with("skinbus: words.txt: no frame in 1000 lines; expected the output of candump"),
             "{command}: {said}"
         );
     }
-    assert!(folder.refuses("view skin.toml --at 1", 2).contains("and this is a skin"));
+    assert!(folder.refuses("view skin.toml --at 1", 2).contains("but this file is a skin"));
     assert!(
-        folder
-            .refuses("skin dbc late.log", 2)
-            .ends_with("late.log is a capture (candump log), but a skin is needed: name the skin's own file")
+        folder.refuses("skin dbc late.log", 2).ends_with(
+            "late.log is a capture (candump log), but this command needs a skin: name a skin file"
+        )
     );
     let mut view = folder.gateway("view late.log --skin skin.toml").stderr(Stdio::piped()).spawn().unwrap();
     let said = BufReader::new(view.stderr.take().unwrap()).lines().next().unwrap().unwrap();

@@ -48,15 +48,17 @@ const MAGIC: &[(&[u8], InputFormat)] = &[
         b"#ROSBAG V",
         InputFormat::Other(
             "a ROS 1 bag",
-            "make an MCAP of it with `rosbags-convert --src FILE --dst NEW --dst-storage mcap` (pip install rosbags), and name NEW/NEW.mcap",
+            "convert it to MCAP with `rosbags-convert --src FILE --dst NEW --dst-storage mcap` (pip install \
+             rosbags), and name NEW/NEW.mcap",
         ),
     ),
     (
         b"SQLite format 3",
         InputFormat::Other(
             "an SQLite database",
-            "of a ROS 2 bag make an MCAP with `rosbags-convert --src FOLDER --dst NEW --dst-storage mcap` (pip install \
-             rosbags), and name NEW/NEW.mcap; of python-can's a candump log with `can_logconvert FILE NEW.log`",
+            "convert a ROS 2 bag to MCAP with `rosbags-convert --src FOLDER --dst NEW --dst-storage mcap` (pip \
+             install rosbags), and name NEW/NEW.mcap; convert a database of python-can to a candump log with \
+             `can_logconvert FILE NEW.log`",
         ),
     ),
     (b"\xFF\xFE", UTF_16),
@@ -70,17 +72,17 @@ const MDF: InputFormat = InputFormat::Other(
 const TRC: InputFormat = InputFormat::Other("a PEAK trace", EXPORT_ADVICE);
 const CSV: InputFormat = InputFormat::Other(
     "a table in CSV",
-    "`can_logconvert FILE NEW.log` makes a candump log of python-can's tables; of others write lines like \
-     `(1700000000.123456) can0 123#00`",
+    "convert a table of python-can to a candump log with `can_logconvert FILE NEW.log`; from other tables, write \
+     lines like `(1700000000.123456) can0 123#00`",
 );
 const PCAP: InputFormat = InputFormat::Other(
     "a packet capture",
-    "write lines like `(1700000000.123456) can0 123#00` from what `tshark -T fields -e frame.time_epoch -e can.id \
-     -e data.data -r FILE` shows (identifiers are decimal there), or take the capture with `candump -l`",
+    "write lines like `(1700000000.123456) can0 123#00` from the output of `tshark -T fields -e frame.time_epoch -e \
+     can.id -e data.data -r FILE` (its identifiers are decimal), or take the capture with `candump -l`",
 );
 const UTF_16: InputFormat = InputFormat::Other(
     "text in UTF-16",
-    "save it as UTF-8, as with `iconv -f utf-16 -t utf-8 FILE > NEW.log`",
+    "save it as UTF-8, for example with `iconv -f utf-16 -t utf-8 FILE > NEW.log`",
 );
 
 /// The format of an input, by its first bytes.

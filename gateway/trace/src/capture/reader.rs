@@ -389,7 +389,8 @@ impl Reader {
             CaptureSource::Log(_) => false,
         };
         let shared = shared.then(|| {
-            "topics have frames of one frame_id: each topic is a bus of its own, and is called by its topic".to_owned()
+            "several topics use the same frame_id: each topic is read as a bus of its own, named after the topic"
+                .to_owned()
         });
         let of_log = self.log_remarks().into_iter().map(|remark| remark.to_string());
         of_log.chain(self.times.remarks()).chain(shared).collect()

@@ -1,7 +1,7 @@
 //! Recognises the kind of a text that has no frames, by its first lines.
 
 const EXPORT_ADVICE: &str =
-    "no converter of it is known here: export it as a candump log from the program that wrote it";
+    "no converter for this format is known: export it as a candump log from the program that wrote it";
 pub(super) const ASC_KIND: (&str, &str) =
     ("a Vector ASC log", "write a candump log with can-utils' `asc2log -I FILE -O NEW.log`");
 
@@ -23,12 +23,12 @@ pub(super) fn detect_text_kind(text: &[u8]) -> Option<(&'static str, &'static st
         (begins_with("***BUSMASTER"), ("a BUSMASTER log", EXPORT_ADVICE)),
         (
             any(&|line| SKIN_TABLES.iter().any(|table| line.starts_with(table))),
-            (SKIN_OR_SCENARIO, "there are no frames in it: name a capture"),
+            (SKIN_OR_SCENARIO, "it contains no frames: name a capture"),
         ),
         (
             any(&|line| line == "BS_:" || line == "NS_ :" || line == "NS_:" || line.starts_with("BO_ "))
                 || begins_with("VERSION \""),
-            ("a DBC file", "it describes signals and holds no frames: name a capture"),
+            ("a DBC file", "it describes signals and contains no frames: name a capture"),
         ),
         (any(&|line| line.starts_with("base hex") || line.starts_with("base dec")), ASC_KIND),
         (any(&|line| line.starts_with("Begin Triggerblock") || line == "// version 7.0.0"), ASC_KIND),
@@ -44,10 +44,10 @@ pub(super) fn detect_text_kind(text: &[u8]) -> Option<(&'static str, &'static st
             ("a CANHacker trace", EXPORT_ADVICE),
         ),
         (begins_with("# Logger type:"), ("a CSS Electronics CLX000 log", EXPORT_ADVICE)),
-        (any(&|line| line.starts_with("< frame ")), ("what socketcand sends", EXPORT_ADVICE)),
+        (any(&|line| line.starts_with("< frame ")), ("output of socketcand", EXPORT_ADVICE)),
         (
             any(&|line| line.starts_with("Timestamp:") && line.contains(" DL:")),
-            ("what python-can prints", "it is no log: let python-can write one with `can_logger -f NEW.log`"),
+            ("output of python-can", "it is not a log: record one with `can_logger -f NEW.log`"),
         ),
         (any(&|line| is_kvaser_line(line)), ("a Kvaser log", EXPORT_ADVICE)),
         (any(&|line| is_crtd_line(&words(line))), ("a CRTD log", EXPORT_ADVICE)),
@@ -55,22 +55,23 @@ pub(super) fn detect_text_kind(text: &[u8]) -> Option<(&'static str, &'static st
         (
             any(&|line| line.contains("]  ") && line.contains("  - '")),
             (
-                "what isotpsniffer prints",
-                "messages put together of frames are no frames: take the capture with `candump -l`",
+                "output of isotpsniffer",
+                "it shows reassembled messages instead of frames: capture the frames with `candump -l`",
             ),
         ),
         (
             all(&|line| line.starts_with('#') || is_frame_of_cansend(line)) && any(&is_frame_of_cansend),
             (
                 "a list of frames for cansend",
-                "there are no times in it: write lines like `(1700000000.123456) can0 123#00`",
+                "its frames have no times: write lines like `(1700000000.123456) can0 123#00`",
             ),
         ),
         (
             is_separated_table(&lines),
             (
                 "a table in CSV",
-                "`can_logconvert FILE NEW.log` makes a candump log of python-can's tables; of others write lines like \
+                "convert a table of python-can to a candump log with `can_logconvert FILE NEW.log`; from other \
+                 tables, write lines like \
                  `(1700000000.123456) can0 123#00`",
             ),
         ),
@@ -156,15 +157,15 @@ mod tests {
             (";  Start time: 10.05.2016\n     1)      1841  0001  8  00 00 00\n", "a PEAK trace"),
             ("1) 2.5 Rx 0300 7 00 00\n", "a PEAK trace"),
             ("# Logger type: 29\n# HW rev: 00.01\nTimestamp ID Data\n", "a CSS Electronics CLX000 log"),
-            ("< hi >\n< frame 0B0B00C9 1701324984.734672 0000 >\n", "what socketcand sends"),
+            ("< hi >\n< frame 0B0B00C9 1701324984.734672 0000 >\n", "output of socketcand"),
             (
                 "Timestamp: 0.0    ID: 123    S Rx                DL:  4    11 22 33 44\n",
-                "what python-can prints",
+                "output of python-can",
             ),
             ("Chn Identifier Flg   DLC  D0...1...2\n", "a Kvaser log"),
             ("1320745424.002 1R11 402 FA 01 C3\n", "a CRTD log"),
             ("2016-02-28T19:57:02.364Z,6,129285,204,255,2,a3,99\n", "a canboat log of NMEA 2000 messages"),
-            (" vcan0  714  [3]  11 22 33  - '.\"3'\n", "what isotpsniffer prints"),
+            (" vcan0  714  [3]  11 22 33  - '.\"3'\n", "output of isotpsniffer"),
             ("309#40\n025#00\n", "a list of frames for cansend"),
             ("#!/bin/sh\ncansend vcan0 1D0#0A\ncansend vcan0 1D0#\n", "a list of frames for cansend"),
             ("time;id;data;dlc\n1;2;3;4\n5;6;7;8\n", "a table in CSV"),

@@ -149,7 +149,7 @@ pub enum FormatError {
         own: u64,
     },
     /// The length field of a message spans other records that follow the message.
-    #[error("a message with a length of {0} bytes reaches over the records after it")]
+    #[error("a message with a length of {0} bytes extends over the records after it")]
     Swallowed(u64),
     /// A record reaches beyond the end of the file, but other records follow its beginning.
     #[error("a record of {bytes} bytes reaches beyond the end of the file, although other records follow it")]
@@ -164,7 +164,7 @@ pub enum FormatError {
     #[error("the file contains more bytes after the end of the recording")]
     TrailingData,
     /// The file holds another number of messages than its statistics record states.
-    #[error("it has {found} messages, but its statistics say {stated}")]
+    #[error("the file contains {found} messages, but its statistics state {stated}")]
     Messages {
         /// The number of messages read.
         found: u64,

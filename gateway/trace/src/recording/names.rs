@@ -94,7 +94,7 @@ pub fn keep_damaged(part: &Path, from: &File) -> io::Result<PathBuf> {
             Err(error) => return Err(error),
         }
     }
-    Err(io::Error::other("it has no name left"))
+    Err(io::Error::other("all names for a copy are already in use"))
 }
 
 /// Returns the existing files of an earlier recording under this name: the first file and the numbered ones.
@@ -135,7 +135,7 @@ impl PartFile {
     /// Returns an error if the file cannot be renamed.
     pub fn finish(&self, force: bool) -> io::Result<()> {
         if !self.has_temporary_name() {
-            return Err(io::Error::other(format!("{} is another file now", self.path.display())));
+            return Err(io::Error::other(format!("{} now names another file", self.path.display())));
         }
         rename(&self.path, &self.goal, force)
     }
@@ -161,7 +161,7 @@ impl PartFile {
     pub fn open(&self) -> io::Result<File> {
         let file = open_no_follow(&self.path)?;
         if device_and_inode(&file.metadata()?) != self.identity {
-            return Err(io::Error::other("it is another file now"));
+            return Err(io::Error::other("the name now belongs to another file"));
         }
         Ok(file)
     }
@@ -331,7 +331,7 @@ fn check_identity(path: &Path, file: &File) -> io::Result<()> {
     if still_names_file(path, device_and_inode(&file.metadata()?)) == Some(true) {
         return Ok(());
     }
-    Err(io::Error::other("another file has its name now, and stays"))
+    Err(io::Error::other("the name now belongs to another file, which was kept"))
 }
 
 #[cfg(test)]

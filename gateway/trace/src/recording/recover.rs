@@ -86,7 +86,7 @@ impl fmt::Display for RecoveryResult {
         }
         match self.damaged {
             (0, _) => {}
-            (_, 0) => write!(f, "; a wrong length in it caused no loss")?,
+            (_, 0) => write!(f, "; a wrong length field caused no loss")?,
             (1, bytes) => write!(f, "; {bytes} damaged bytes are lost")?,
             (places, bytes) => write!(f, "; {bytes} damaged bytes in {places} places are lost")?,
         }
@@ -98,7 +98,7 @@ impl fmt::Display for RecoveryResult {
             )?;
         }
         if self.is_checksum_wrong && self.is_undamaged() {
-            write!(f, "; a checksum of the whole file was wrong, but none of a chunk")?;
+            write!(f, "; the checksum of the whole file was wrong, but those of its chunks were right")?;
         }
         Ok(())
     }

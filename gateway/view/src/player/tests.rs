@@ -228,7 +228,7 @@ fn a_recording_without_frames_is_refused() {
     let path = folder.path().join("empty.log");
     std::fs::write(&path, "nothing\n").unwrap();
     let error = Player::open(&[path], skin()).unwrap_err().to_string();
-    assert!(error.ends_with("empty.log: there is no frame in it"), "{error}");
+    assert!(error.ends_with("empty.log: the recording contains no frames"), "{error}");
 }
 
 /// Generates times of frames: any times, times near the limits of 64 bits of ns, and times near each other.

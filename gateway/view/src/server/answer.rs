@@ -56,9 +56,7 @@ impl RefusalReason {
                  with ?token=...",
             ),
             Self::NoFile => ("404 Not Found", "no such file: open the address printed after `view:`"),
-            Self::NoPage => {
-                ("426 Upgrade Required", "this address is the page's WebSocket, and is available")
-            }
+            Self::NoPage => ("426 Upgrade Required", "this address accepts only the WebSocket of the page"),
             Self::Late => ("408 Request Timeout", "the request took longer than 5 s"),
             Self::Long => ("431 Request Header Fields Too Large", "the request is longer than 8 KiB"),
             Self::Crowded => {

@@ -81,7 +81,7 @@ test("a cell's shape says the worst about it, and each shape is another", () => 
   const of = (status, flags) => shapeOf({ status, flags }).name;
   assert.equal(of(2, 0), "normal");
   assert.equal(of(4, 3), "silent");
-  assert.equal(of(0, 0), "never heard");
+  assert.equal(of(0, 0), "no frame received");
   assert.equal(of(1, 1 | 2), "no parameters");
   assert.equal(of(1, 2 | 8), "different parameters");
   assert.equal(of(3, 8), "stale: no reply");
@@ -270,8 +270,8 @@ test("a halt is told with its reason and the next step", () => {
   const said = (bench, mayPress = true) => haltedWords({ halted: true, bench }, mayPress);
   assert.equal(said(bench("too many bad cycles")), "The robot is halted: too many bad cycles. Press Resume to continue.");
   assert.equal(said(bench("no torque", true)), "The robot is halted: no torque. Bring the bus up, then press Resume.");
-  assert.equal(said(null), "The robot is halted by a Halt on the bus. Press Resume to continue.");
-  assert.equal(said(null, false), "The robot is halted by a Halt on the bus.");
+  assert.equal(said(null), "The robot is halted by a halt frame on the bus. Press Resume to continue.");
+  assert.equal(said(null, false), "The robot is halted by a halt frame on the bus.");
   // A run with its bus down knows of the halt before any frame tells it.
   assert.match(haltedWords({ halted: false, bench: bench("no bus", true) }, true), /^The robot is halted: no bus/);
 });

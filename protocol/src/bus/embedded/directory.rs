@@ -62,7 +62,11 @@ pub enum DirectoryError {
         mode: u32,
     },
     /// The path of the bus's socket is longer than a socket address allows.
-    #[error("{} is too long for a socket, whose path has at most 107 bytes: set SKINBUS_DIR to a shorter one", .0.display())]
+    #[error(
+        "{} is too long for a socket, whose path can have at most 107 bytes: set SKINBUS_DIR to a shorter \
+         path",
+        .0.display()
+    )]
     TooLong(PathBuf),
     /// The directory cannot be opened or created. Symbolic links are not followed.
     #[error("cannot use {} as the directory of embedded buses: {source}; set SKINBUS_DIR to a directory of your own", path.display())]

@@ -34,27 +34,29 @@ fn describe_allowed_values(path: &str, message: &str) -> Option<String> {
         .strip_prefix("invalid length ")
         .and_then(|rest| rest.split_once(", expected an array of length "))
     {
-        return Some(format!("{target} values are needed, not {got}"));
+        return Some(format!("must have {target} values, not {got}"));
     }
     let (got, expected) = message.strip_prefix("invalid type: ")?.split_once(", expected ")?;
     Some(match expected {
-        "a sequence" if got == "map" => format!("it is a list of tables: write [[{path}]]"),
-        "f64" => "a number is needed".to_owned(),
+        "a sequence" if got == "map" => format!("must be a list of tables: write [[{path}]]"),
+        "f64" => "must be a number".to_owned(),
         "i64" | "u64" | "u32" | "u8" if got.starts_with("integer ") => "the number is too large".to_owned(),
         "i64" | "u64" | "u32" | "u8" => match parse_cell_name(got) {
             Some(CellName { bus: Some(bus), node }) => {
-                format!("a whole number is needed: write {node}, and bus = \"{bus}\" as a separate key")
+                format!("must be a whole number: write {node}, and bus = \"{bus}\" as a separate key")
             }
-            Some(_) | None => "a whole number is needed".to_owned(),
+            Some(_) | None => "must be a whole number".to_owned(),
         },
-        table if table.starts_with("struct ") => format!("it is a table: write [{path}], and its keys below"),
-        "a string" => "text in quotes is needed".to_owned(),
-        "a boolean" => "true or false is needed".to_owned(),
+        table if table.starts_with("struct ") => {
+            format!("must be a table: write [{path}], and its keys below")
+        }
+        "a string" => "must be text in quotes".to_owned(),
+        "a boolean" => "must be true or false".to_owned(),
         list if list == "a sequence" || list.starts_with("an array") || list.starts_with("a tuple") => {
-            "a list of values in brackets is needed".to_owned()
+            "must be a list of values in brackets".to_owned()
         }
         // A value of several types lists them itself.
-        either if either.starts_with("either ") => format!("{either} is needed"),
+        either if either.starts_with("either ") => format!("must be {either}"),
         _ => return None,
     })
 }

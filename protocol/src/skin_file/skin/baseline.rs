@@ -27,13 +27,13 @@ pub(super) fn skin_baseline(raw: Option<raw::RawBaseline>) -> Result<Baseline, D
     }
     at.with_key("hysteresis").set_fixed_if_given(raw.hysteresis, &mut to.hysteresis, Q1_14::try_nearest)?;
     if let Some(got) = raw.hysteresis.filter(|&part| part > 1.0) {
-        return Err(at.with_key("hysteresis").fault(got, "a part of the threshold: 0 to 1 is possible"));
+        return Err(at.with_key("hysteresis").fault(got, "must be 0 to 1, as a fraction of the threshold"));
     }
     at.with_key("limit_n").set_fixed_if_given(raw.limit_n, &mut to.limit, Q5_10::try_nearest)?;
     set_temperature_slope(&at.with_key("n_per_c"), raw.n_per_c, &mut to)?;
     if let Some(got) = raw.rate_n_per_s {
         to.rate_un_per_s = to_micronewtons_per_s(got)
-            .ok_or_else(|| at.with_key("rate_n_per_s").fault(got, "1e-6 to 0.065535 N/s are possible"))?;
+            .ok_or_else(|| at.with_key("rate_n_per_s").fault(got, "must be 1e-6 to 0.065535 N/s"))?;
     }
     Ok(match follows {
         None => Baseline::Off,
@@ -52,7 +52,7 @@ pub(super) fn cell_baseline(
         let given = [("baseline_limit_n", raw.baseline_limit_n), ("baseline_n_per_c", raw.baseline_n_per_c)];
         let given = given.into_iter().find_map(|(key, value)| Some((key, value?)));
         return given.map_or(Ok(base), |(key, value)| {
-            Err(at.with_key(key).fault(value, "the skin has no [baseline], or its mode is \"off\""))
+            Err(at.with_key(key).fault(value, "allowed only with a [baseline] whose mode is not \"off\""))
         });
     };
     at.with_key("baseline_limit_n").set_fixed_if_given(
@@ -124,7 +124,7 @@ mod tests {
         assert_eq!(read("[baseline]", cell), Ok(Baseline::On(own)));
         let why = read("", cell).unwrap_err();
         assert!(
-            why.ends_with("baseline_limit_n = 1.5: the skin has no [baseline], or its mode is \"off\""),
+            why.ends_with("baseline_limit_n = 1.5: allowed only with a [baseline] whose mode is not \"off\""),
             "{why}"
         );
     }
@@ -132,12 +132,12 @@ mod tests {
     #[test]
     fn what_cannot_be_is_refused_in_one_line() {
         for (key, why) in [
-            ("mode = \"on\"", "baseline.mode = \"on\": \"off\", \"hold\" or \"follow\""),
+            ("mode = \"on\"", "baseline.mode = \"on\": must be \"off\", \"hold\" or \"follow\""),
             ("threshold_n = 0.0", "baseline.threshold_n = 0: must be above 0"),
             ("limit_n = -1.0", "baseline.limit_n = -1: must not be negative"),
-            ("hysteresis = 1.5", "baseline.hysteresis = 1.5: a part of the threshold: 0 to 1 is possible"),
-            ("rate_n_per_s = 0.0", "baseline.rate_n_per_s = 0: 1e-6 to 0.065535 N/s are possible"),
-            ("rate_n_per_s = 0.1", "baseline.rate_n_per_s = 0.1: 1e-6 to 0.065535 N/s are possible"),
+            ("hysteresis = 1.5", "baseline.hysteresis = 1.5: must be 0 to 1, as a fraction of the threshold"),
+            ("rate_n_per_s = 0.0", "baseline.rate_n_per_s = 0: must be 1e-6 to 0.065535 N/s"),
+            ("rate_n_per_s = 0.1", "baseline.rate_n_per_s = 0.1: must be 1e-6 to 0.065535 N/s"),
         ] {
             let said = read(&format!("[baseline]\n{key}"), "").unwrap_err();
             assert!(said.ends_with(why), "{said}");

@@ -13,10 +13,10 @@ const MAX_BUSES: usize = 64;
 
 pub(super) fn check_buses(raw: &[raw::RawBus], robot: &Robot) -> Checked<Vec<SkinBus>> {
     if raw.is_empty() {
-        return Err(KeyPath::top_level_key("bus").fault("[]", "at least one bus is needed"));
+        return Err(KeyPath::top_level_key("bus").fault("[]", "a skin must have at least one bus"));
     }
     if raw.len() > MAX_BUSES {
-        let why = format!("a skin has at most {MAX_BUSES} buses");
+        let why = format!("a skin can have at most {MAX_BUSES} buses");
         return Err(KeyPath::top_level_key("bus").fault(format!("{} buses", raw.len()), why));
     }
     let mut seen = HashSet::new();
@@ -24,11 +24,12 @@ pub(super) fn check_buses(raw: &[raw::RawBus], robot: &Robot) -> Checked<Vec<Ski
         let at = KeyPath::top_level_key("bus").with_index(index);
         let name = bus.name.clone();
         if !crate::bus::is_plain_name(&name) || name.starts_with('.') {
-            let why = "an interface's name has 1 to 15 letters, digits, `-`, `_` or `.`";
+            let why = "a bus name must have 1 to 15 letters, digits, `-`, `_` or `.`";
             return Err(at.with_key("name").fault(format_args!("{name:?}"), why));
         }
         if !seen.insert(name.clone()) {
-            return Err(at.with_key("name").fault(format_args!("{name:?}"), "this bus is named twice"));
+            let why = "another bus already has this name";
+            return Err(at.with_key("name").fault(format_args!("{name:?}"), why));
         }
         let reply = check_reply(&at, bus)?;
         let format = at
@@ -50,10 +51,11 @@ fn chain_index(at: &KeyPath, bus: &raw::RawBus, robot: &Robot) -> Checked<usize>
     let at = at.with_key("chain");
     match &bus.chain {
         Some(name) => robot.chains.iter().position(|chain| chain.name == *name).ok_or_else(|| {
-            at.fault(format_args!("{name:?}"), format_args!("no such chain; there is {}", names()))
+            let why = format!("the robot has no such chain; its chains are {}", names());
+            at.fault(format_args!("{name:?}"), why)
         }),
         None if robot.chains.len() == 1 => Ok(0),
-        None => Err(at.fault("", format_args!("which chain? there is {}", names()))),
+        None => Err(at.fault("", format_args!("must name the chain of this bus: one of {}", names()))),
     }
 }
 
@@ -72,7 +74,7 @@ fn torque_format(at: &KeyPath, bus: &raw::RawBus, robot: &Robot, chain: usize) -
 /// Checks the reply of the cells of a bus to joints.
 fn check_reply(at: &KeyPath, bus: &raw::RawBus) -> Checked<SkinReply> {
     let sums = at.with_key("reply").parse_choice(&bus.reply, &[("torque", false), ("sum", true)])?;
-    let only_sum = "only with reply = \"sum\"";
+    let only_sum = "allowed only with reply = \"sum\"";
     match (sums, bus.slot_us, bus.carry) {
         (false, None, None) => Ok(SkinReply::Torque),
         (false, Some(got), _) => Err(at.with_key("slot_us").fault(got, only_sum)),
@@ -81,7 +83,7 @@ fn check_reply(at: &KeyPath, bus: &raw::RawBus) -> Checked<SkinReply> {
             Ok(slot_us @ 1..) => Ok(SkinReply::Sum { slot_us, carry: carry.unwrap_or(true) }),
             Ok(0) | Err(_) => Err(at.with_key("slot_us").fault(got, "must be above 0")),
         },
-        (true, None, _) => Err(at.with_key("reply").fault("\"sum\"", "slot_us is needed with it")),
+        (true, None, _) => Err(at.with_key("reply").fault("\"sum\"", "this reply needs the key slot_us too")),
     }
 }
 
@@ -93,10 +95,10 @@ fn check_bit_rates(at: &KeyPath, bus: &raw::RawBus, format: Format) -> Checked<(
     let data_bitrate = match (bus.data_bitrate, format, bitrate) {
         (None, _, _) => None,
         (Some(got), Format::Classic, _) => {
-            return Err(at.with_key("data_bitrate").fault(got, "only with format = \"fd\""));
+            return Err(at.with_key("data_bitrate").fault(got, "allowed only with format = \"fd\""));
         }
         (Some(got), Format::Fd, None) => {
-            return Err(at.with_key("data_bitrate").fault(got, "only together with bitrate"));
+            return Err(at.with_key("data_bitrate").fault(got, "allowed only together with bitrate"));
         }
         (Some(got), Format::Fd, Some(min)) => {
             Some(within("data_bitrate", got, min, BitRates::MAX_DATA_BIT_RATE)?)

@@ -35,7 +35,9 @@ impl FromStr for CellName {
 /// Returns an error if the bus name before the colon is empty.
 pub fn split_bus(text: &str) -> Result<(Option<&str>, &str), String> {
     match text.rsplit_once(':') {
-        Some(("", _)) => Err("no bus precedes the colon: write NODE or BUS:NODE".to_owned()),
+        Some(("", _)) => {
+            Err("the name of the bus before the colon is missing: write NODE or BUS:NODE".to_owned())
+        }
         Some((bus, node)) => Ok((Some(bus), node)),
         None => Ok((None, text)),
     }
@@ -74,7 +76,7 @@ mod tests {
             ("vcan0", "\"vcan0\" is not a node id"),
             ("vcan0:", "\"\" is not a node id"),
             ("vcan0:255", "\"255\" is not a node id: use 1 to 254"),
-            (":3", "no bus precedes the colon"),
+            (":3", "the name of the bus before the colon is missing"),
         ] {
             assert!(text.parse::<CellName>().unwrap_err().contains(why), "{text}");
         }

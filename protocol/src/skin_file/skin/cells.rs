@@ -42,7 +42,7 @@ pub(super) fn check_cells(
     }
     for (index, port, cell, neighbor) in neighbor_mentions(&cells) {
         if neighbor == cell.node || !taken.contains_key(&(cell.bus, neighbor)) {
-            let why = "must be the node of another cell on the same bus, or 0";
+            let why = "must be the node id of another cell on the same bus, or 0";
             return Err(KeyPath::top_level_key("cell")
                 .with_index(index)
                 .with_key("neighbors")
@@ -98,7 +98,7 @@ fn check_cell(
 ) -> Checked<Cell> {
     let bus = bus_index(at, raw, buses)?;
     let node = CellId::new(raw.node);
-    let why = "a cell's node is 1 to 254; further cells need another bus";
+    let why = "must be 1 to 254; further cells need another bus";
     let node = node.map_err(|_| at.with_key("node").fault(raw.node, why))?;
     let (joint, row) = joint_and_row(at, raw, robot, buses.get(bus).map_or(0, |bus| bus.chain))?;
     for (axis, &value) in raw.position.iter().enumerate() {
@@ -110,7 +110,8 @@ fn check_cell(
     if reach >= MAX_REACH {
         let [x, y, z] = raw.position;
         let why = format!(
-            "node {node} can be {reach:.3} m away from a frame of its rows, {:.3} m more than the {MAX_REACH} m that Q1.14 can hold",
+            "node {node} can be {reach:.3} m away from a frame of its rows, {:.3} m more than the \
+             {MAX_REACH} m that fit into Q1.14",
             reach - MAX_REACH
         );
         return Err(at.with_key("position").fault(format_args!("[{x}, {y}, {z}]"), why));
@@ -119,7 +120,7 @@ fn check_cell(
     for (port, (neighbor, &got)) in neighbors.iter_mut().zip(&raw.neighbors).enumerate() {
         if got != 0 {
             let wrong =
-                |_| at.with_key("neighbors").with_index(port).fault(got, "a node is 1 to 254, or 0 for none");
+                |_| at.with_key("neighbors").with_index(port).fault(got, "must be 1 to 254, or 0 for none");
             *neighbor = Some(CellId::new(got).map_err(wrong)?);
         }
     }
@@ -182,17 +183,17 @@ fn joint_and_row(at: &KeyPath, raw: &raw::RawCell, robot: &Robot, chain: usize) 
         number.ok_or_else(|| at.with_key(key).fault(got, format_args!("{what} 1 to {max}")))
     };
     let joint = raw.joint.map(|got| within("joint", got, joints, "the robot has joints")).transpose()?;
-    let row = raw.row.map(|got| within("row", got, rows, "its chain has rows")).transpose()?;
+    let row = raw.row.map(|got| within("row", got, rows, "the chain has rows")).transpose()?;
     match (joint, row) {
         (None, None) => Err(at
             .with_key("joint")
-            .fault("", format_args!("which joint moves the cell? the joints are 1 to {joints}"))),
+            .fault("", format_args!("must name the joint that moves the cell: 1 to {joints}"))),
         (Some(joint), None) => Ok((joint, chain.row_of(joint).unwrap_or_default())),
         (given, Some(row)) => match chain.joint_of_row(row) {
-            0 => Err(at.with_key("row").fault(row, "no joint moves what this row carries")),
+            0 => Err(at.with_key("row").fault(row, "no joint moves this row")),
             joint if given.is_none_or(|given| given == joint) => Ok((joint, row)),
             joint => {
-                let why = format!("this row is moved by joint {joint}: correct the joint, or leave it out");
+                let why = format!("joint {joint} moves this row: correct the key joint, or leave it out");
                 Err(at.with_key("row").fault(row, why))
             }
         },
@@ -205,10 +206,11 @@ fn bus_index(at: &KeyPath, raw: &raw::RawCell, buses: &[SkinBus]) -> Checked<usi
     let at = at.with_key("bus");
     match &raw.bus {
         Some(name) => buses.iter().position(|bus| bus.name == *name).ok_or_else(|| {
-            at.fault(format_args!("{name:?}"), format_args!("no such bus; there is {}", names()))
+            let why = format!("the skin has no such bus; its buses are {}", names());
+            at.fault(format_args!("{name:?}"), why)
         }),
         None if buses.len() == 1 => Ok(0),
-        None => Err(at.fault("", format_args!("which bus? there is {}", names()))),
+        None => Err(at.fault("", format_args!("must name the bus of the cell: one of {}", names()))),
     }
 }
 
@@ -221,10 +223,10 @@ fn cell_normal(at: &KeyPath, raw: &raw::RawCell) -> Checked<[f64; 3]> {
         }
         (None, Some(normal)) => normalized(&at.with_key("normal"), "vector", normal),
         (Some(_), Some(_)) => {
-            Err(at.with_key("normal").fault("", "either a normal or an orientation, not both"))
+            Err(at.with_key("normal").fault("", "give either normal or orientation, not both"))
         }
         (None, None) => {
-            let why = "where does the cell face? give the x, y, z of its outward normal, or its orientation";
+            let why = "missing: give the outward normal of the cell as [x, y, z], or its orientation";
             Err(at.with_key("normal").fault("", why))
         }
     }

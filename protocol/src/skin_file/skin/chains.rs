@@ -21,7 +21,8 @@ const UNIT_LENGTH_TOLERANCE: f64 = 1e-3;
 pub(super) fn check_robot(raw: raw::RawRobot) -> Checked<Robot> {
     let at = KeyPath::top_level_key("robot");
     if raw.urdf.as_ref().is_some_and(String::is_empty) {
-        return Err(at.with_key("urdf").fault("\"\"", "the path of a file, from the skin's file"));
+        let why = "must be the path of a file, relative to the skin file";
+        return Err(at.with_key("urdf").fault("\"\"", why));
     }
     match (raw.joints, raw.joint.is_empty() && raw.chain.is_empty()) {
         (Some(rows), true) => {
@@ -31,18 +32,18 @@ pub(super) fn check_robot(raw: raw::RawRobot) -> Checked<Robot> {
             if raw.limits_rad.is_some() {
                 return Err(at
                     .with_key("limits_rad")
-                    .fault("", "with [[robot.joint]] each joint has its limits"));
+                    .fault("", "not allowed with [[robot.joint]]: give the limits of each joint there"));
             }
             let joints = check_joints(&at, &raw.joint)?;
             let chains = check_chains(&at, &raw.chain, &joints)?;
             Ok(Robot { name: raw.name, urdf: raw.urdf, joints, chains })
         }
         (Some(_), false) => {
-            let why = "either joints, or [[robot.joint]] and [[robot.chain]], not both";
+            let why = "give either joints, or [[robot.joint]] and [[robot.chain]], not both";
             Err(at.with_key("joints").fault("", why))
         }
         (None, true) => {
-            let why = "give the rows of its joints, or [[robot.joint]] and [[robot.chain]]";
+            let why = "missing: give the rows of the robot's joints, or [[robot.joint]] and [[robot.chain]]";
             Err(at.with_key("joints").fault("", why))
         }
     }
@@ -57,7 +58,7 @@ fn serial_robot(
 ) -> Checked<Robot> {
     let count = rows.len();
     if count == 0 || count > MAX_JOINTS {
-        let why = format!("1 to {MAX_JOINTS} revolute joints are allowed in this key");
+        let why = format!("must have 1 to {MAX_JOINTS} revolute joints");
         return Err(at.with_key("joints").fault(format_args!("{count} joints"), why));
     }
     for (index, row) in rows.iter().enumerate() {
@@ -97,12 +98,15 @@ fn check_limits(at: &KeyPath, [min, max]: [f64; 2], kind: JointKind) -> Checked<
     let got = format!("[{min}, {max}]");
     // This form also refuses NaN.
     if !(min.is_finite() && max.is_finite() && min < max) {
-        return Err(at.fault(got, "the smaller position comes first"));
+        return Err(at.fault(got, "the smaller position must come first"));
     }
     if kind == JointKind::Prismatic && (min < -MAX_PRISMATIC_POSITION_M || max > MAX_PRISMATIC_POSITION_M) {
         return Err(at.fault(
             got,
-            format_args!("a joint slides within -{MAX_PRISMATIC_POSITION_M} to {MAX_PRISMATIC_POSITION_M} m"),
+            format_args!(
+                "a prismatic joint must stay within -{MAX_PRISMATIC_POSITION_M} to \
+                 {MAX_PRISMATIC_POSITION_M} m"
+            ),
         ));
     }
     Ok([min, max])
@@ -111,14 +115,14 @@ fn check_limits(at: &KeyPath, [min, max]: [f64; 2], kind: JointKind) -> Checked<
 fn check_joints(at: &KeyPath, raw: &[raw::RawJoint]) -> Checked<Vec<Joint>> {
     let count = raw.len();
     if count == 0 || count > MAX_ROBOT_JOINTS {
-        let why = format!("a robot has 1 to {MAX_ROBOT_JOINTS} joints");
+        let why = format!("a robot must have 1 to {MAX_ROBOT_JOINTS} joints");
         return Err(at.with_key("joint").fault(format_args!("{count} joints"), why));
     }
     let mut joints: Vec<Joint> = Vec::with_capacity(count);
     for (index, raw) in raw.iter().enumerate() {
         let at = at.with_key("joint").with_index(index);
         if raw.name.is_empty() || joints.iter().any(|joint| joint.name == raw.name) {
-            let why = "each joint has a name of its own";
+            let why = "each joint must have a unique name";
             return Err(at.with_key("name").fault(format_args!("{:?}", raw.name), why));
         }
         let kinds = [JointKind::Revolute, JointKind::Prismatic].map(|kind| (kind.name(), kind));
@@ -127,7 +131,7 @@ fn check_joints(at: &KeyPath, raw: &[raw::RawJoint]) -> Checked<Vec<Joint>> {
             (Some(limits), _) => limits,
             (None, JointKind::Revolute) => [-TAU, TAU],
             (None, JointKind::Prismatic) => {
-                return Err(at.with_key("limits").fault("", "a prismatic joint needs them, in m"));
+                return Err(at.with_key("limits").fault("", "a prismatic joint needs limits, in m"));
             }
         };
         let limits = check_limits(&at.with_key("limits"), given, kind)?;
@@ -138,13 +142,13 @@ fn check_joints(at: &KeyPath, raw: &[raw::RawJoint]) -> Checked<Vec<Joint>> {
 
 fn check_chains(at: &KeyPath, raw: &[raw::RawChain], joints: &[Joint]) -> Checked<Vec<Chain>> {
     if raw.is_empty() {
-        return Err(at.with_key("chain").fault("[]", "at least one chain is needed"));
+        return Err(at.with_key("chain").fault("[]", "a robot must have at least one chain"));
     }
     let mut chains: Vec<Chain> = Vec::with_capacity(raw.len());
     for (index, raw) in raw.iter().enumerate() {
         let at = at.with_key("chain").with_index(index);
         if raw.name.is_empty() || chains.iter().any(|chain| chain.name == raw.name) {
-            let why = "each chain has a name of its own";
+            let why = "each chain must have a unique name";
             return Err(at.with_key("name").fault(format_args!("{:?}", raw.name), why));
         }
         chains.push(check_chain(&at, raw, joints)?);
@@ -152,7 +156,7 @@ fn check_chains(at: &KeyPath, raw: &[raw::RawChain], joints: &[Joint]) -> Checke
     let unused = |(index, _): &(usize, &Joint)| chains.iter().all(|chain| !chain.joints.contains(index));
     if let Some((index, joint)) = joints.iter().enumerate().find(unused) {
         let at = at.with_key("joint").with_index(index).with_key("name");
-        return Err(at.fault(format_args!("{:?}", joint.name), "no chain has this joint"));
+        return Err(at.fault(format_args!("{:?}", joint.name), "no chain contains this joint"));
     }
     Ok(chains)
 }
@@ -163,7 +167,7 @@ fn check_base(at: &KeyPath, raw: &raw::RawBase) -> Checked<ChainBase> {
     {
         return Err(at.with_key("position").with_index(index).fault(
             value,
-            format_args!("it must be within -{MAX_BASE_COORDINATE_M} to {MAX_BASE_COORDINATE_M} m"),
+            format_args!("must be within -{MAX_BASE_COORDINATE_M} to {MAX_BASE_COORDINATE_M} m"),
         ));
     }
     let orientation = raw.orientation.map(|it| normalized(&at.with_key("orientation"), "quaternion", it));
@@ -176,7 +180,7 @@ fn check_base(at: &KeyPath, raw: &raw::RawBase) -> Checked<ChainBase> {
 fn check_chain(at: &KeyPath, raw: &raw::RawChain, joints: &[Joint]) -> Checked<Chain> {
     let count = raw.rows.len();
     if count > MAX_ROWS {
-        let why = format!("a chain has at most {MAX_ROWS} rows");
+        let why = format!("a chain can have at most {MAX_ROWS} rows");
         return Err(at.with_key("rows").fault(format_args!("{count} rows"), why));
     }
     let mut chain = Chain {
@@ -200,10 +204,11 @@ fn check_chain(at: &KeyPath, raw: &raw::RawChain, joints: &[Joint]) -> Checked<C
         let at = at.with_key("joint");
         let known = joints.iter().position(|joint| joint.name == *name);
         let known = known.and_then(|number| Some((number, joints.get(number)?)));
-        let (number, joint) = known
-            .ok_or_else(|| at.fault(format_args!("{name:?}"), "no such joint: name one of robot.joint"))?;
+        let (number, joint) = known.ok_or_else(|| {
+            at.fault(format_args!("{name:?}"), "the robot has no such joint: name one of [[robot.joint]]")
+        })?;
         if chain.joints.contains(&number) {
-            return Err(at.fault(format_args!("{name:?}"), "this chain has the joint already"));
+            return Err(at.fault(format_args!("{name:?}"), "this chain already contains the joint"));
         }
         let [min, max] = joint.limits;
         if joint.kind == JointKind::Prismatic
@@ -219,7 +224,8 @@ fn check_chain(at: &KeyPath, raw: &raw::RawChain, joints: &[Joint]) -> Checked<C
     }
     let moving = chain.joints.len();
     if moving == 0 || moving > MAX_JOINTS {
-        let why = format!("a chain has 1 to {MAX_JOINTS} joints, which are rows with the name of a joint");
+        let why =
+            format!("a chain must have 1 to {MAX_JOINTS} joints, which are its rows with the key joint");
         return Err(at.with_key("rows").fault(format_args!("{moving} joints"), why));
     }
     Ok(chain)
@@ -229,7 +235,7 @@ pub(super) fn check_joint_count(at: &KeyPath, got: usize, joints: usize) -> Chec
     if got == joints {
         return Ok(());
     }
-    let why = format!("one value for each of the robot's {joints} joints is needed");
+    let why = format!("must have one value for each of the robot's {joints} joints");
     Err(at.fault(format_args!("{got} values"), why))
 }
 

@@ -29,7 +29,7 @@ pub(super) fn check_skin_of_bus(raw: raw::RawSkin, bus: &str) -> Checked<Skin> {
         Some(index) => Err(KeyPath::top_level_key("cell")
             .with_index(index)
             .with_key("bus")
-            .fault("", "the cell of another bus")),
+            .fault("", "this cell is on another bus")),
     }
 }
 
@@ -51,7 +51,7 @@ fn check_skin(raw: raw::RawSkin, has_cells: impl Fn(&SkinBus) -> bool) -> Checke
     let cells = cells::check_cells(&raw.cell, &robot, &buses, base)?;
     let skin = Skin { name: raw.name, robot, timing, events, buses, controller, safety, cells };
     let Some(period_us) = skin.broadcast_period_us() else {
-        let why = "at least 15.3 Hz are possible";
+        let why = "must be at least 15.3 Hz";
         return Err(KeyPath::top_level_key("timing")
             .with_key("joint_broadcast_hz")
             .fault(raw.timing.joint_broadcast_hz, why));
@@ -72,7 +72,8 @@ fn check_skin(raw: raw::RawSkin, has_cells: impl Fn(&SkinBus) -> bool) -> Checke
 fn check_sum_tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Checked<()> {
     let at = KeyPath::top_level_key("bus").with_index(index);
     if !skin.cells_on_bus(index).any(|cell| cell.root) {
-        let why = "sums need a path to the gateway, but no cell of this bus has root = true: set it for one";
+        let why =
+            "sums need a path to the gateway, but no cell of this bus has root = true: set it for one cell";
         return Err(at.with_key("reply").fault("\"sum\"", why));
     }
     let depths = skin.wires(index).cell_depths();
@@ -97,7 +98,7 @@ fn check_sum_tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Ch
     }
     let max = u32::from(period_us).checked_div(slots).unwrap_or(0);
     let hint = if max > 0 {
-        format!("at most {max} us fit")
+        format!("use at most {max} us")
     } else {
         "no slots fit: send joints less often, or use more roots or buses".to_owned()
     };
@@ -111,7 +112,7 @@ fn check_timing(raw: &raw::RawTiming) -> Checked<SkinTiming> {
     let at = KeyPath::top_level_key("timing");
     let control_hz = raw.control_hz;
     if !(1.0..=10_000.0).contains(&control_hz) {
-        return Err(at.with_key("control_hz").fault(control_hz, "1 to 10000 Hz are possible"));
+        return Err(at.with_key("control_hz").fault(control_hz, "must be 1 to 10000 Hz"));
     }
     let broadcast_hz = at.with_key("joint_broadcast_hz").check_positive(raw.joint_broadcast_hz)?;
     let ratio = (control_hz / broadcast_hz).round();
@@ -145,7 +146,7 @@ fn check_controller(raw: raw::RawController, joints: usize) -> Checked<Controlle
         if at.with_key("kind").parse_choice(&raw.kind, &[("kinesthetic", true), ("external", false)])? {
             let external = [("socket", raw.socket.is_some()), ("start_s", raw.start_s.is_some())];
             if let Some((key, _)) = external.into_iter().find(|(_, is_there)| *is_there) {
-                return Err(at.with_key(key).fault("", "only with kind = \"external\""));
+                return Err(at.with_key(key).fault("", "allowed only with kind = \"external\""));
             }
             ControllerKind::Kinesthetic {
                 inertia: each_or("inertia", raw.inertia, 1.0)?,
@@ -153,13 +154,13 @@ fn check_controller(raw: raw::RawController, joints: usize) -> Checked<Controlle
             }
         } else {
             if raw.inertia.is_some() || raw.damping.is_some() {
-                let why = "inertia and damping are only for \"kinesthetic\"";
+                let why = "inertia and damping are allowed only with kind = \"kinesthetic\"";
                 return Err(at.with_key("kind").fault("\"external\"", why));
             }
-            let why = "the path of a Unix socket is needed with kind = \"external\"";
+            let why = "missing: kind = \"external\" needs the path of a Unix socket";
             let start_s = raw.start_s.unwrap_or(5.0);
             if !(0.0..=3_600.0).contains(&start_s) {
-                return Err(at.with_key("start_s").fault(start_s, "0 to 3600 s are possible"));
+                return Err(at.with_key("start_s").fault(start_s, "must be 0 to 3600 s"));
             }
             ControllerKind::External {
                 socket: raw.socket.ok_or_else(|| at.with_key("socket").fault("", why))?,
@@ -168,7 +169,7 @@ fn check_controller(raw: raw::RawController, joints: usize) -> Checked<Controlle
         };
     let max_speed = match (raw.max_speed, raw.max_speed_rad_s) {
         (Some(_), Some(_)) => {
-            let why = "the former name of max_speed: give one of them";
+            let why = "this is the former name of max_speed: give only one of them";
             return Err(at.with_key("max_speed_rad_s").fault("", why));
         }
         (None, Some(former)) => each_positive("max_speed_rad_s", former)?,

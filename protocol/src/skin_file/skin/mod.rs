@@ -252,7 +252,7 @@ impl Skin {
     /// # Errors
     /// Returns the first error in the text.
     pub fn parse(path: &str, text: &str) -> Result<Self, DocumentError> {
-        let what = "this is a scenario, not a skin: `skinbus run SKIN --scenario SCENARIO` takes both";
+        let what = "this is a scenario, not a skin: give it as `skinbus run SKIN --scenario SCENARIO`";
         document::parse(path, text, check::check_whole_skin)
             .map_err(|error: DocumentError| error.detect_wrong_kind(text, SCENARIO_KEYS, SKIN_KEYS, what))
     }

@@ -16,7 +16,7 @@ pub(super) fn check_names(skin: &raw::RawSkin) -> Checked<()> {
         [(KeyPath::top_level_key("name"), &skin.name), (robot.with_key("name"), &skin.robot.name)]
     {
         if given.is_empty() {
-            return Err(at.fault("\"\"", "a name has at least one character"));
+            return Err(at.fault("\"\"", "a name must have at least one character"));
         }
         check_name(&at, given)?;
     }
@@ -34,7 +34,7 @@ fn check_name(at: &KeyPath, name: &str) -> Checked<()> {
     if count > MAX_CHARACTERS {
         return Err(at.fault(
             format!("{count} characters"),
-            format!("a name has at most {MAX_CHARACTERS} characters"),
+            format!("a name can have at most {MAX_CHARACTERS} characters"),
         ));
     }
     if let Some(character) = name.chars().find(|&character| is_unprintable(character)) {

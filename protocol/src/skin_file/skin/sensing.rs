@@ -13,7 +13,7 @@ use crate::parameters::{Events, Sensing};
 pub fn continuous_sensing(hz: f64) -> Result<Sensing, String> {
     let period = 1_000.0 / hz;
     if !(hz > 0.0 && (0.999..65_535.5).contains(&period)) {
-        return Err("0.0153 to 1000 Hz are possible".to_owned());
+        return Err("must be 0.0153 to 1000 Hz".to_owned());
     }
     let nearest = period.round().max(1.0);
     if (period - nearest).abs() > 1e-3 * period {
@@ -45,10 +45,10 @@ pub(super) fn bus_sensing(at: &KeyPath, bus: &raw::RawBus) -> Result<Sensing, Do
             continuous_sensing(hz).map_err(|why| at.with_key("sensing_hz").fault(hz, why))
         }
         (SensingModeName::Continuous, None) => {
-            Err(at.with_key("sensing").fault("\"continuous\"", "sensing_hz is needed with it"))
+            Err(at.with_key("sensing").fault("\"continuous\"", "this mode needs the key sensing_hz too"))
         }
         (SensingModeName::Off | SensingModeName::Event, Some(hz)) => {
-            Err(at.with_key("sensing_hz").fault(hz, "only with sensing = \"continuous\""))
+            Err(at.with_key("sensing_hz").fault(hz, "allowed only with sensing = \"continuous\""))
         }
         (SensingModeName::Off, None) => Ok(Sensing::Off),
         (SensingModeName::Event, None) => Ok(Sensing::Event),
@@ -65,7 +65,7 @@ pub(super) fn check_events(raw: raw::RawEvents) -> Result<Events, DocumentFault>
     let mut events = Events::default();
     at.with_key("hysteresis").set_fixed_if_given(raw.hysteresis, &mut events.hysteresis, round_threshold)?;
     if let Some(got) = raw.hysteresis.filter(|&part| part > 1.0) {
-        return Err(at.with_key("hysteresis").fault(got, "a part of a threshold: 0 to 1 is possible"));
+        return Err(at.with_key("hysteresis").fault(got, "must be 0 to 1, as a fraction of each threshold"));
     }
     at.with_key("contact_n").set_fixed_if_given(raw.contact_n, &mut events.contact, round_threshold)?;
     at.with_key("proximity").set_fixed_if_given(raw.proximity, &mut events.proximity, round_threshold)?;
@@ -95,7 +95,7 @@ mod tests {
         );
         assert_eq!(period(1.0 / 65.535), Ok(65_535));
         for hz in [0.0, -1.0, f64::NAN, f64::INFINITY, 1_100.0, 0.015] {
-            assert_eq!(period(hz), Err("0.0153 to 1000 Hz are possible".to_owned()), "{hz}");
+            assert_eq!(period(hz), Err("must be 0.0153 to 1000 Hz".to_owned()), "{hz}");
         }
         let why = "its period must be a whole number of ms; the nearest rates are 58.8235 and 62.5000 Hz";
         assert_eq!(period(60.0), Err(why.to_owned()));

@@ -104,7 +104,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("node = 2", "node = 255"),
-        "skin.toml:40: cell[1].node = 255: a cell's node is 1 to 254; further cells need another bus"
+        "skin.toml:40: cell[1].node = 255: must be 1 to 254; further cells need another bus"
     );
     assert_eq!(
         says("joint = 1", "joint = 3"),
@@ -117,12 +117,12 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("[0.1, 0.0, 0.06]", "[1.6, 0.0, 0.0]"),
-        "skin.toml:34: cell[0].position = [1.6, 0, 0]: \
-         node 1 can be 2.100 m away from a frame of its rows, 0.101 m more than the 1.999 m that Q1.14 can hold"
+        "skin.toml:34: cell[0].position = [1.6, 0, 0]: node 1 can be 2.100 m away from a frame of its rows, \
+         0.101 m more than the 1.999 m that fit into Q1.14"
     );
     assert_eq!(
         says("[controller]", "[[bus]]\nname = \"vcan0\"\nreply = \"torque\"\nformat = \"fd\"\n[controller]"),
-        "skin.toml:25: bus[1].name = \"vcan0\": this bus is named twice"
+        "skin.toml:25: bus[1].name = \"vcan0\": another bus already has this name"
     );
     assert_eq!(
         says("control_hz", "contrl_hz"),
@@ -134,29 +134,29 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("62.5", "10.0"),
-        "skin.toml:13: timing.joint_broadcast_hz = 10: at least 15.3 Hz are possible"
+        "skin.toml:13: timing.joint_broadcast_hz = 10: must be at least 15.3 Hz"
     );
     assert_eq!(
         says("reply = \"torque\"", "reply = \"talk\""),
-        "skin.toml:21: bus[0].reply = \"talk\": \"torque\" or \"sum\""
+        "skin.toml:21: bus[0].reply = \"talk\": must be \"torque\" or \"sum\""
     );
     assert_eq!(
         says("inertia = [1.0, 1.0]", "inertia = [1.0]"),
-        "skin.toml:26: controller.inertia = 1 values: one value for each of the robot's 2 joints is needed"
+        "skin.toml:26: controller.inertia = 1 values: must have one value for each of the robot's 2 joints"
     );
-    assert_eq!(says("a = 0.5", "a = 2.5"), "skin.toml:8: robot.joints[1].a = 2.5: the range is [-2, 2)");
+    assert_eq!(says("a = 0.5", "a = 2.5"), "skin.toml:8: robot.joints[1].a = 2.5: must be in [-2, 2)");
     assert_eq!(
         says("alpha_c = 0.5", "alpha_c = 8.5"),
-        "skin.toml:44: cell[1].alpha_c = 8.5: the range is [-8, 8)"
+        "skin.toml:44: cell[1].alpha_c = 8.5: must be in [-8, 8)"
     );
     assert_eq!(
         says("neighbors = [2,", "neighbors = [9,"),
-        "skin.toml:36: cell[0].neighbors[0] = 9: must be the node of another cell on the same bus, or 0"
+        "skin.toml:36: cell[0].neighbors[0] = 9: must be the node id of another cell on the same bus, or 0"
     );
     assert_eq!(
         says("name = \"vcan0\"", "name = \"a-very-long-name\""),
-        "skin.toml:20: bus[0].name = \"a-very-long-name\": \
-         an interface's name has 1 to 15 letters, digits, `-`, `_` or `.`"
+        "skin.toml:20: bus[0].name = \"a-very-long-name\": a bus name must have 1 to 15 letters, digits, \
+         `-`, `_` or `.`"
     );
 }
 
@@ -180,7 +180,7 @@ fn names_that_mislead_are_refused_and_escaped_in_recordings() {
     let long = format!("name = \"{}\"", "e".repeat(201));
     assert_eq!(
         says("name = \"elbow\"", &long),
-        "skin.toml:5: robot.name = 201 characters: a name has at most 200 characters"
+        "skin.toml:5: robot.name = 201 characters: a name can have at most 200 characters"
     );
     Skin::parse_recorded("skin.toml", &GOOD.replacen("name = \"elbow\"", &long, 1)).unwrap();
     for name in ["Grüße 機器人", "a b", "\u{1f916}"] {
@@ -196,7 +196,7 @@ fn a_robot_may_say_where_its_urdf_is() {
     let skin = Skin::parse("skin.toml", &with).unwrap();
     assert_eq!(skin.robot.urdf.as_deref(), Some("../elbow.urdf"));
     let said = says("name = \"elbow\"", "name = \"elbow\"\nurdf = \"\"");
-    assert_eq!(said, "skin.toml:6: robot.urdf = \"\": the path of a file, from the skin's file");
+    assert_eq!(said, "skin.toml:6: robot.urdf = \"\": must be the path of a file, relative to the skin file");
 }
 
 #[test]
@@ -219,17 +219,17 @@ fn a_robot_of_joints_and_chains_names_what_is_wrong_with_them() {
         };
         what
     };
-    let slides =
-        |got: &str| format!("robot.joint[0].limits = {got}: a joint slides within -1.999 to 1.999 m");
+    let range = "a prismatic joint must stay within -1.999 to 1.999 m";
+    let slides = |got: &str| format!("robot.joint[0].limits = {got}: {range}");
     assert_eq!(wrong("-0.5, 1.0", "-2.1, 1.0"), slides("[-2.1, 1]"));
     assert_eq!(wrong("-0.5, 1.0", "-0.5, 2.1"), slides("[-0.5, 2.1]"));
-    let own = |got: &str| format!("robot.joint[1].name = {got:?}: each joint has a name of its own");
+    let own = |got: &str| format!("robot.joint[1].name = {got:?}: each joint must have a unique name");
     assert_eq!(wrong("name = \"elbow\"\n[[robot.chain]]", "name = \"lift\"\n[[robot.chain]]"), own("lift"));
     assert_eq!(wrong("name = \"elbow\"\n[[robot.chain]]", "name = \"\"\n[[robot.chain]]"), own(""));
     let unused = wrong(", { joint = \"elbow\" }", "");
-    assert_eq!(unused, "robot.joint[1].name = \"elbow\": no chain has this joint");
-    assert_eq!(wrong(chain, ""), "robot.chain = []: at least one chain is needed");
-    let both = "robot.joints: either joints, or [[robot.joint]] and [[robot.chain]], not both";
+    assert_eq!(unused, "robot.joint[1].name = \"elbow\": no chain contains this joint");
+    assert_eq!(wrong(chain, ""), "robot.chain = []: a robot must have at least one chain");
+    let both = "robot.joints: give either joints, or [[robot.joint]] and [[robot.chain]], not both";
     assert_eq!(wrong("[robot]\n", "[robot]\njoints = []\n"), both);
 }
 
@@ -264,19 +264,19 @@ fn sums_need_a_tree_that_reaches_everyone_and_fits_the_period() {
     assert_eq!(bus(without), SkinReply::Sum { slot_us: 1, carry: false });
     assert_eq!(
         fault("reply = \"torque\"\ncarry = true", &CHAIN),
-        "skin.toml:22: bus[0].carry = true: only with reply = \"sum\""
+        "skin.toml:22: bus[0].carry = true: allowed only with reply = \"sum\""
     );
     assert_eq!(
         fault("reply = \"sum\"\nslot_us = 4001", &CHAIN),
         "skin.toml:22: bus[0].slot_us = 4001: the tree needs 4 slots within the 16000 us between two joint \
-         broadcasts: at most 4000 us fit"
+         broadcasts: use at most 4000 us"
     );
     let mut cells = CHAIN;
     cells[0].1 = false;
     assert_eq!(
         fault(without, &cells),
         "skin.toml:21: bus[0].reply = \"sum\": sums need a path to the gateway, but no cell of this bus has \
-         root = true: set it for one"
+         root = true: set it for one cell"
     );
     let link_down = |cells: &[_]| fault(without, cells).split_once(": no wires").unwrap().1.to_owned();
     cells = CHAIN;
@@ -316,22 +316,22 @@ fn bit_rates_are_optional_and_checked() {
     assert_eq!(rates("bitrate = 500000\ndata_bitrate = 500000"), (Some(500_000), Some(500_000)));
 
     let fault = |lines: &str| by_line(Skin::parse("skin.toml", &with(lines)).unwrap_err());
-    let range = "10000 to 1000000 bit/s are possible";
+    let range = "must be 10000 to 1000000 bit/s";
     assert_eq!(fault("bitrate = 9999"), format!("skin.toml:23: bus[0].bitrate = 9999: {range}"));
     assert_eq!(fault("bitrate = 1000001"), format!("skin.toml:23: bus[0].bitrate = 1000001: {range}"));
     assert_eq!(fault("bitrate = -1"), format!("skin.toml:23: bus[0].bitrate = -1: {range}"));
     assert_eq!(
         fault("bitrate = 500000\ndata_bitrate = 499999"),
-        "skin.toml:24: bus[0].data_bitrate = 499999: 500000 to 8000000 bit/s are possible"
+        "skin.toml:24: bus[0].data_bitrate = 499999: must be 500000 to 8000000 bit/s"
     );
     assert_eq!(
         fault("data_bitrate = 5000000"),
-        "skin.toml:23: bus[0].data_bitrate = 5000000: only together with bitrate"
+        "skin.toml:23: bus[0].data_bitrate = 5000000: allowed only together with bitrate"
     );
     let classic = with("bitrate = 500000\ndata_bitrate = 500000").replace(format, "format = \"classic\"");
     assert_eq!(
         by_line(Skin::parse("skin.toml", &classic).unwrap_err()),
-        "skin.toml:24: bus[0].data_bitrate = 500000: only with format = \"fd\""
+        "skin.toml:24: bus[0].data_bitrate = 500000: allowed only with format = \"fd\""
     );
 }
 
@@ -340,14 +340,14 @@ fn a_broken_file_says_where_in_one_line() {
     let error = says("version = 1", "version = = 1");
     assert!(error.starts_with("skin.toml:1: ") && error.lines().count() == 1, "{error}");
     for (from, to, said) in [
-        ("joint = 2\n", "", "skin.toml:30: cell[0].joint: which joint moves the cell? the joints are 1 to 2"),
-        ("joint = 2", "joint = \"two\"", "skin.toml:33: cell[0].joint = \"two\": a whole number is needed"),
+        ("joint = 2\n", "", "skin.toml:30: cell[0].joint: must name the joint that moves the cell: 1 to 2"),
+        ("joint = 2", "joint = \"two\"", "skin.toml:33: cell[0].joint = \"two\": must be a whole number"),
         ("joint = 2", "joint = 18446744073709551616", "= 18446744073709551616: the number is too large"),
         ("joint = 2", "joint = \"vcan0:2\"", ": write 2, and bus = \"vcan0\" as a separate key"),
-        ("version = 1", "version = 1\nevents = 5", ": it is a table: write [events], and its keys below"),
-        ("joint = 2", "joint = 2.5", "skin.toml:33: cell[0].joint = 2.5: a whole number is needed"),
-        ("control_hz = 500.0", "control_hz = \"500\"", "timing.control_hz = \"500\": a number is needed"),
-        ("[[bus]]", "[bus]", "bus: it is a list of tables: write [[bus]]"),
+        ("version = 1", "version = 1\nevents = 5", ": must be a table: write [events], and its keys below"),
+        ("joint = 2", "joint = 2.5", "skin.toml:33: cell[0].joint = 2.5: must be a whole number"),
+        ("control_hz = 500.0", "control_hz = \"500\"", "timing.control_hz = \"500\": must be a number"),
+        ("[[bus]]", "[bus]", "bus: must be a list of tables: write [[bus]]"),
         (
             "alpha_c = 1.0",
             "alpha_c = pi/2",
@@ -384,15 +384,15 @@ fn sensing_is_off_unless_said_and_its_keys_are_checked() {
     let fault = |lines: &str| by_line(Skin::parse("skin.toml", &with(lines)).unwrap_err());
     assert_eq!(
         fault("sensing = \"always\""),
-        "skin.toml:23: bus[0].sensing = \"always\": \"off\", \"continuous\" or \"event\""
+        "skin.toml:23: bus[0].sensing = \"always\": must be \"off\", \"continuous\" or \"event\""
     );
     assert_eq!(
         fault("sensing = \"continuous\""),
-        "skin.toml:23: bus[0].sensing = \"continuous\": sensing_hz is needed with it"
+        "skin.toml:23: bus[0].sensing = \"continuous\": this mode needs the key sensing_hz too"
     );
     assert_eq!(
         fault("sensing = \"event\"\nsensing_hz = 10"),
-        "skin.toml:24: bus[0].sensing_hz = 10: only with sensing = \"continuous\""
+        "skin.toml:24: bus[0].sensing_hz = 10: allowed only with sensing = \"continuous\""
     );
     assert_eq!(
         fault("sensing = \"continuous\"\nsensing_hz = 60.0"),
@@ -412,10 +412,10 @@ fn thresholds_of_events_have_defaults_and_fit_their_words() {
 
     let fault = |lines: &str| by_line(Skin::parse("skin.toml", &with(lines)).unwrap_err());
     assert_eq!(fault("contact_n = -1.0"), "skin.toml:25: events.contact_n = -1: must not be negative");
-    assert_eq!(fault("contact_n = 32.0"), "skin.toml:25: events.contact_n = 32: the range is [0, 32)");
+    assert_eq!(fault("contact_n = 32.0"), "skin.toml:25: events.contact_n = 32: must be in [0, 32)");
     assert_eq!(
         fault("hysteresis = 1.5"),
-        "skin.toml:25: events.hysteresis = 1.5: a part of a threshold: 0 to 1 is possible"
+        "skin.toml:25: events.hysteresis = 1.5: must be 0 to 1, as a fraction of each threshold"
     );
     assert_eq!(
         fault("force_n = 1.0"),
@@ -435,7 +435,7 @@ fn a_skin_has_at_most_64_buses() {
     };
     assert_eq!(with(64).unwrap().buses.len(), 64);
     let error = by_line(with(65).unwrap_err());
-    assert!(error.contains("65 buses") && error.contains("a skin has at most 64 buses"), "{error}");
+    assert!(error.contains("65 buses") && error.contains("a skin can have at most 64 buses"), "{error}");
 }
 
 #[test]
@@ -472,11 +472,11 @@ normal = [0.0, 0.6, 0.8]
         |from: &str, to: &str| by_line(Skin::parse("skin.toml", &SHORT.replace(from, to)).unwrap_err());
     assert_eq!(
         fault("0.8]", "0.8]\norientation = [0.0, 0.0, 0.0, 1.0]"),
-        "skin.toml:7: cell[0].normal: either a normal or an orientation, not both"
+        "skin.toml:7: cell[0].normal: give either normal or orientation, not both"
     );
     assert_eq!(
         fault("normal = [0.0, 0.6, 0.8]", ""),
-        "skin.toml:3: cell[0].normal: where does the cell face? give the x, y, z of its outward normal, or its \
+        "skin.toml:3: cell[0].normal: missing: give the outward normal of the cell as [x, y, z], or its \
          orientation"
     );
     assert_eq!(
@@ -485,7 +485,7 @@ normal = [0.0, 0.6, 0.8]
     );
     assert_eq!(
         fault("[[cell]]", "[[bus]]\n[[bus]]\nname = \"vcan1\"\n[[cell]]"),
-        "skin.toml:6: cell[0].bus: which bus? there is \"vcan0\", \"vcan1\""
+        "skin.toml:6: cell[0].bus: must name the bus of the cell: one of \"vcan0\", \"vcan1\""
     );
 }
 
@@ -493,7 +493,7 @@ normal = [0.0, 0.6, 0.8]
 fn a_scenario_is_known_for_what_it_is() {
     let text = "duration_s = 2.0\n[[touch]]\nall = true\nforce_n = 1.0\n";
     let said = Skin::parse("s.toml", text).unwrap_err().to_string();
-    let hint = "this is a scenario, not a skin: `skinbus run SKIN --scenario SCENARIO` takes both";
+    let hint = "this is a scenario, not a skin: give it as `skinbus run SKIN --scenario SCENARIO`";
     assert_eq!(said, format!("s.toml: {hint}"));
     let said = says("[controller]", "[motion]\n[controller]");
     assert!(said.contains("unknown field `motion`"), "a skin with a key too many: {said}");

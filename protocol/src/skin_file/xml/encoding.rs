@@ -53,7 +53,8 @@ pub fn decode(bytes: &[u8]) -> Result<Cow<'_, str>, XmlFault> {
             let from = if matches!(other, "" | "utf-8" | "utf8" | "us-ascii") { "latin1" } else { other };
             let declared = if other.is_empty() { String::new() } else { format!(", declared as {other}") };
             let what = format!(
-                "it is not UTF-8{declared}: save it as UTF-8, as with `iconv -f {from} -t utf-8 FILE > NEW` (if it is in Latin-1)"
+                "it is not UTF-8{declared}: save it as UTF-8, for example with `iconv -f {from} -t utf-8 \
+                 FILE > NEW` (if it is in Latin-1)"
             );
             let what = if from == "latin1" { what } else { what.replace(" (if it is in Latin-1)", "") };
             Err(XmlFault { line: Some(line), what })
@@ -137,11 +138,12 @@ mod tests {
         let refused = |bytes: &[u8]| decode(bytes).unwrap_err().to_string();
         assert_eq!(
             refused(b"<r>\n<!-- \xfc --></r>"),
-            "line 2: it is not UTF-8: save it as UTF-8, as with `iconv -f latin1 -t utf-8 FILE > NEW` (if it is in Latin-1)"
+            "line 2: it is not UTF-8: save it as UTF-8, for example with `iconv -f latin1 -t utf-8 FILE > \
+             NEW` (if it is in Latin-1)"
         );
         assert_eq!(
             refused(b"<?xml version='1.0' encoding='GBK'?>\n<r n='\xc4\xe3'/>"),
-            "line 2: it is not UTF-8, declared as gbk: save it as UTF-8, as with `iconv -f gbk -t utf-8 FILE > NEW`"
+            "line 2: it is not UTF-8, declared as gbk: save it as UTF-8, for example with `iconv -f gbk -t utf-8 FILE > NEW`"
         );
         assert!(refused(b"\xff\xfe<\0r\0/\0>").contains("truncated"));
     }

@@ -24,7 +24,10 @@ pub fn detect_unexpected_file(bytes: &[u8]) -> Option<UnexpectedFileKind> {
     }
     let is = |begin: &[u8]| text.get(..begin.len()).is_some_and(|head| head.eq_ignore_ascii_case(begin));
     if is(b"<!doctype html") || is(b"<html") {
-        return whole("a web page (HTML), as a server sends for a wrong address", "download the file itself");
+        return whole(
+            "a web page (HTML), which a server may send if the address is wrong",
+            "download the file itself",
+        );
     }
     for (magic, what) in [
         (&b"PK\x03\x04"[..], "a zip archive"),
@@ -36,7 +39,7 @@ pub fn detect_unexpected_file(bytes: &[u8]) -> Option<UnexpectedFileKind> {
         }
     }
     let conflict = bytes.split(|byte| *byte == b'\n').position(|line| line.starts_with(CONFLICT_MARKER))?;
-    let hint = "keep one side, and delete the lines <<<<<<<, =======, >>>>>>> and the other side";
+    let hint = "keep one side, and delete the other side and the lines <<<<<<<, ======= and >>>>>>>";
     Some(UnexpectedFileKind { line: Some(conflict + 1), what: "a merge conflict of git", hint })
 }
 
@@ -44,13 +47,13 @@ pub fn detect_unexpected_file(bytes: &[u8]) -> Option<UnexpectedFileKind> {
 #[must_use]
 pub fn format_of_root_element(name: &str) -> Option<&'static str> {
     Some(match name {
-        "sdf" | "gazebo" | "world" => "an SDF file, of Gazebo",
-        "mujoco" => "an MJCF file, of MuJoCo",
+        "sdf" | "gazebo" | "world" => "an SDF file of Gazebo",
+        "mujoco" => "an MJCF file of MuJoCo",
         "robot" => "a robot's description (URDF or SRDF)",
         "COLLADA" => "a COLLADA mesh",
         "svg" => "an SVG drawing",
-        "launch" => "a launch file, of ROS",
-        "package" => "a package.xml, of ROS",
+        "launch" => "a launch file of ROS",
+        "package" => "a package.xml of ROS",
         "html" => "a web page (HTML)",
         "Error" => "an error message of a server",
         _ => return None,

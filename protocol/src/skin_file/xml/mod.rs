@@ -132,8 +132,8 @@ impl<'a> XmlSurvey<'a> {
             }
             XmlPart::DocType(range) => {
                 if of(&range).contains('[') {
-                    let what = "a <!DOCTYPE with definitions, which are not read: delete it, and write what its \
-                                entities stand for in their places";
+                    let what = "the <!DOCTYPE contains definitions, which this program does not read: delete it, and \
+                                replace its entities by their values";
                     return Err((range.start, what.to_owned()));
                 }
                 self.blanked.push(range);
@@ -153,7 +153,7 @@ impl<'a> XmlSurvey<'a> {
         if count > MAX_ATTRIBUTES {
             let name = tag.name.chars().take(40).collect::<String>();
             let what = format!(
-                "element {name} has {count} attributes, and at most {MAX_ATTRIBUTES} are read: delete some"
+                "element {name} has {count} attributes, but at most {MAX_ATTRIBUTES} are allowed: delete some"
             );
             return Err((tag.range.start, what));
         }
@@ -187,7 +187,7 @@ impl<'a> XmlSurvey<'a> {
         ] {
             if count > most {
                 let what =
-                    format!("it has {count} {what}, and at most {most} are read: delete the unused ones");
+                    format!("it has {count} {what}, but at most {most} are allowed: delete the unused ones");
                 return Err(XmlFault { line: None, what });
             }
         }
@@ -262,7 +262,7 @@ mod tests {
         let inner = repaired("<r><a xmlns:s='x'/><s:b/></r>");
         assert!(inner.starts_with("<r xmlns:s=\"unbound:s\">"), "{inner}");
         let many: String = (0..65).map(|number| format!("<p{number}:a/>")).collect();
-        assert!(refused(&format!("<r>{many}</r>")).contains("it has 65 prefixes of names, and at most 64"));
+        assert!(refused(&format!("<r>{many}</r>")).contains("it has 65 prefixes of names, but at most 64"));
         let nested: String = (0..5_000).map(|number| format!("<x xmlns:a{number}='1'>")).collect();
         assert!(refused(&nested).contains("it has 5000 prefixes"));
         let again = "<x xmlns='1'/>".repeat(MAX_PREFIX_BINDINGS + 1);
@@ -276,7 +276,8 @@ mod tests {
         assert_eq!(repaired("<!DOCTYPE r SYSTEM \"a>b.dtd\"><r/>").trim_start(), "<r/>");
         assert_eq!(
             refused("\n<!DOCTYPE r [ <!ENTITY a \"]>\"> ]>\n<r/>"),
-            "line 2: a <!DOCTYPE with definitions, which are not read: delete it, and write what its entities stand for in their places"
+            "line 2: the <!DOCTYPE contains definitions, which this program does not read: delete it, and \
+             replace its entities by their values"
         );
     }
 
@@ -297,7 +298,7 @@ mod tests {
         assert!(prepare(&element(MAX_ATTRIBUTES)).is_ok());
         assert_eq!(
             refused(&element(50_000)),
-            "line 2: element e has 50000 attributes, and at most 256 are read: delete some"
+            "line 2: element e has 50000 attributes, but at most 256 are allowed: delete some"
         );
     }
 }

@@ -197,8 +197,10 @@ impl<'a> Cursor<'a> {
             _ => return Err(wrong(expected)),
         };
         if self.accept(b'#') {
-            let flags =
-                self.peek().and_then(parse_hex_digit).ok_or_else(|| self.error("one digit of FD flags"))?;
+            let flags = self
+                .peek()
+                .and_then(parse_hex_digit)
+                .ok_or_else(|| self.error("one hexadecimal digit of FD flags"))?;
             self.at += 1;
             // CAN FD has no remote frames.
             return self.parse_data_frame(id & !REMOTE, Format::Fd, flags).map(Some);
@@ -261,7 +263,7 @@ impl<'a> Cursor<'a> {
                 self.at += 1;
                 Ok(frame.with_raw_dlc(dlc))
             }
-            _ => Err(self.error("a raw DLC of 9 to F, of a classic frame of 8 bytes")),
+            _ => Err(self.error("a raw DLC of 9 to F, which only a classic frame of 8 bytes can have")),
         }
     }
 

@@ -40,10 +40,13 @@ pub enum ParameterError {
         got: i16,
     },
     /// The period of the joint broadcast is zero.
-    #[error("a joint broadcast every 0 us is not possible")]
+    #[error("the period of joint broadcasts is 0 us; it must be above 0")]
     Period,
     /// The number of rows is out of range, or does not match the joints.
-    #[error("{got} rows are not possible; use one for each of the {joints} joints, and at most {MAX_ROWS}")]
+    #[error(
+        "{got} rows are not possible; use at least one for each of the {joints} joints, and at most \
+         {MAX_ROWS}"
+    )]
     Rows {
         /// The requested number of rows.
         got: i16,
@@ -51,7 +54,9 @@ pub enum ParameterError {
         joints: i16,
     },
     /// The row that carries the cell is not the row of its joint or a fixed row after it.
-    #[error("row {got} of {rows} does not follow the joint that moves the cell")]
+    #[error(
+        "row {got} of {rows} cannot carry the cell; it must be the row of its joint, or a fixed row after it"
+    )]
     Row {
         /// The requested row.
         got: i16,

@@ -92,7 +92,7 @@ pub fn find_parameter(name: &str) -> Option<&'static Layout> {
 #[must_use]
 pub fn refusal_reason(number: i64) -> &'static str {
     let found = refusal_reasons().iter().find(|(known, _)| i64::from(*known) == number);
-    found.map_or("for a reason that this version does not know", |(_, meaning)| meaning)
+    found.map_or("unknown reason", |(_, meaning)| meaning)
 }
 
 #[cfg(test)]

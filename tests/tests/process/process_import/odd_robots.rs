@@ -34,7 +34,7 @@ fn a_mesh_that_stands_for_another_file_is_named() {
     refused(
         &place,
         &words,
-        "plate.stl: a Git LFS pointer to a file, not the file: fetch it with `git lfs pull`",
+        "plate.stl: this is a Git LFS pointer to a file, not the file: fetch it with `git lfs pull`",
     );
 }
 
@@ -46,7 +46,7 @@ fn a_faulty_visual_stops_only_what_needs_it() {
     refused(
         &place,
         &format!("{COVER} --leave-out plate"),
-        "arm.urdf:4: link \"fore\": size = \"0.08\": three lengths in m",
+        "arm.urdf:4: link \"fore\": size = \"0.08\": must be three lengths in m",
     );
     let said = run(&place, "skin show skin.toml -o skin.html").succeeded().stderr;
     assert!(said.contains("2 links not drawn: arm.urdf:4: link \"fore\": size = \"0.08\""), "{said}");

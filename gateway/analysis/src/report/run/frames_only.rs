@@ -11,8 +11,6 @@ use super::motion::TickSeries;
 pub(super) struct FramesOnlyCapture {
     /// Kind of the capture for use in a sentence, without article: `candump log`.
     pub(super) format: &'static str,
-    /// Kind of the capture with its article, as the subject of a sentence: `a log`.
-    pub(super) noun: &'static str,
     /// Name of the file of the skin.
     pub(super) skin_file: String,
     /// The bus whose joints determine the times of the series, as an index into the skin's buses.
@@ -26,10 +24,9 @@ pub(super) struct FramesOnlyCapture {
 
 impl FramesOnlyCapture {
     pub(super) fn new(is_log: bool, skin_file: &str) -> Self {
-        let (format, noun) =
-            if is_log { ("candump log", "a log") } else { ("MCAP file of another program", "frames alone") };
+        let format = if is_log { "candump log" } else { "MCAP file of another program" };
         let skin_file = skin_file.to_owned();
-        Self { format, noun, skin_file, clock: None, is_halted: false, end: 0.0, began: None }
+        Self { format, skin_file, clock: None, is_halted: false, end: 0.0, began: None }
     }
 
     /// Handles a frame on one of the skin's buses; `effect` is its effect on the series.
@@ -60,7 +57,7 @@ impl FramesOnlyCapture {
             Some(FrameEffect::Halted(is_halted))
                 if std::mem::replace(&mut self.is_halted, is_halted) != is_halted =>
             {
-                motion.record_change(at, if is_halted { "halted" } else { "goes on" });
+                motion.record_change(at, if is_halted { "halted" } else { "resumed" });
             }
             Some(FrameEffect::Halted(_)) | None => {}
         }
@@ -81,8 +78,8 @@ impl FramesOnlyCapture {
         });
         let has_torque = motion.distributed.iter().any(|line| line.points().iter().any(|(_, y)| *y != 0.0));
         let all = [
-            (!has_joints, "joints, and with them torques and replies"),
-            (has_torque && !compared, "stimuli or sensors, and with them central torques"),
+            (!has_joints, "joints messages, and so no torques and replies"),
+            (has_torque && !compared, "stimuli or sensors, and so no central torques"),
             (true, "joint velocities"),
             (true, "ticks and cycle times"),
             (true, "the scenario"),
@@ -127,9 +124,9 @@ mod tests {
             );
         }
         frames_only.finish(&mut motion);
-        assert_eq!(motion.changes, [(1.0, "halted"), (2.0, "goes on")]);
+        assert_eq!(motion.changes, [(1.0, "halted"), (2.0, "resumed")]);
         assert!((motion.duration_s() - 3.0).abs() < 1e-9);
         let missing = frames_only.missing_parts(&[], &motion);
-        assert_eq!(missing.first(), Some(&"joints, and with them torques and replies"));
+        assert_eq!(missing.first(), Some(&"joints messages, and so no torques and replies"));
     }
 }

@@ -49,8 +49,8 @@ pub enum ReportError {
     Capture(#[from] CaptureError),
     /// The capture has frames only, and the options do not name its skin.
     #[error(
-        "{name} is a log, which has only frames: name their skin with --skin, or record with `skinbus run SKIN \
-         --record run.mcap`, which keeps the skin"
+        "{name} is a candump log, which contains only frames: name the skin with --skin, or make a recording, which \
+         contains the skin, with `skinbus run SKIN --record run.mcap`"
     )]
     Log {
         /// Name of the capture.
@@ -65,7 +65,7 @@ pub enum ReportError {
         what: String,
     },
     /// The skin in the options differs from the one in the recording.
-    #[error("{name} was recorded with another skin")]
+    #[error("{name} was recorded with a different skin")]
     OtherSkin {
         /// Name of the recording.
         name: String,
@@ -160,7 +160,8 @@ pub fn report(paths: &[PathBuf], options: &ReportOptions) -> Result<RunReport, R
     let (run, broken, is_damaged) = read_recording(paths, options)?;
     let missing = broken.map(|why| run.early_end_sentence(&why));
     let page = page::report_page(&run, &options.command, missing.as_deref());
-    let lacking = run.frames_only.as_ref().map(|it| format!("not in {}: {}", it.noun, run.missing_parts()));
+    let is_frames_only = run.frames_only.is_some();
+    let lacking = is_frames_only.then(|| format!("the capture does not contain: {}", run.missing_parts()));
     let remarks = lacking.into_iter().chain(run.remarks).collect();
     Ok(RunReport { page, missing, is_damaged, name: run.name, remarks })
 }
@@ -452,7 +453,8 @@ impl RunData {
     fn unusable_reason(&self, items: &Reader) -> Option<String> {
         if !items.has_times() {
             return Some(
-                "has lines without times: a report needs them, as `candump -L` writes them".to_owned(),
+                "has lines without time stamps, which a report needs: make the log with `candump -L`"
+                    .to_owned(),
             );
         }
         if self.bus_figures.iter().any(|bus_figures| bus_figures.frames > 0) {
@@ -467,7 +469,7 @@ impl RunData {
                 )
             }
             (None, Some((what, hint))) => format!("is {what}, not a candump log or MCAP recording: {hint}"),
-            (None, None) => "has no frame in it: a log is what `candump -L` writes".to_owned(),
+            (None, None) => "contains no frame: expected a log as `candump -L` writes it".to_owned(),
         })
     }
 
@@ -489,6 +491,6 @@ impl RunData {
         let lacks = planned.filter(|planned| *planned > here).map_or_else(String::new, |planned| {
             format!(" of the planned {planned} s: {:.2} s are missing", planned - here)
         });
-        format!("{why}. It covers {here:.2} s{lacks}")
+        format!("{why}. The recording covers {here:.2} s{lacks}")
     }
 }

@@ -114,7 +114,7 @@ impl TickSeries {
         }
         if timing.halted != self.halt {
             self.halt = timing.halted;
-            self.record_change(at, if timing.halted == 0 { "goes on" } else { "halted" });
+            self.record_change(at, if timing.halted == 0 { "resumed" } else { "halted" });
         }
     }
 

@@ -61,7 +61,7 @@ pub(super) fn report_page(run: &RunData, command: &str, missing: Option<&str>) -
 
 fn intro_of_run(run: &RunData) -> String {
     format!(
-        "A run of {} on {} and {} of its {} control loop, from the recording {}. Times count from the first tick.",
+        "{} on {}: a run of {} with a control loop of {}, from the recording {}. Times count from the first tick.",
         skin_size_text(run),
         count_text(run.skin.buses.len(), "bus", "buses"),
         format_seconds(run.motion.duration_s()),
@@ -73,13 +73,13 @@ fn intro_of_run(run: &RunData) -> String {
 fn intro_of_frames(run: &RunData, frames_only: &FramesOnlyCapture) -> String {
     let remarks: String = run.remarks.iter().map(|remark| format!(" {remark}.")).collect();
     format!(
-        "Frames of {} on {} during {}, from the {} {}. Times count from the first joints message. Not in {}: {}.{remarks}",
+        "Frames of {} on {} during {}, from the {} {}. Times count from the first joints message. This capture does \
+         not contain: {}.{remarks}",
         skin_size_text(run),
         count_text(run.skin.buses.len(), "bus", "buses"),
         format_seconds(run.motion.duration_s()),
         frames_only.format,
         run.name,
-        frames_only.noun,
         run.missing_parts(),
     )
 }
@@ -160,19 +160,23 @@ impl PageDraft<'_> {
             );
             findings.push(Finding::less_is_better(what, law, (median, "µs")));
         }
-        findings.push(Finding::new_unrated("cells", skin.cells.len() as f64).with_paper_value(PAPER_CELLS));
+        findings.push(
+            Finding::new_unrated("number of cells", skin.cells.len() as f64).with_paper_value(PAPER_CELLS),
+        );
         if motion.duration_s() > 0.0 {
             let hertz = |count: u64, seconds: f64| (count.saturating_sub(1) as f64 / seconds, "Hz");
             if motion.counts.ticks > 0 {
                 let ticks = motion.counts.ticks.saturating_add(motion.counts.unrecorded);
                 let loop_hz = hertz(ticks, motion.duration_s());
-                findings
-                    .push(Finding::new_unrated("control loop", loop_hz).with_paper_value(PAPER_CONTROL_HZ));
+                findings.push(
+                    Finding::new_unrated("rate of the control loop", loop_hz)
+                        .with_paper_value(PAPER_CONTROL_HZ),
+                );
             }
             let joints = self.run.bus_figures.iter().filter_map(|bus_figures| bus_figures.joints);
             let most = joints.max_by_key(|(_, _, count)| *count).filter(|(first, last, _)| last > first);
             if let Some((first, last, count)) = most {
-                let finding = Finding::new_unrated("joints", hertz(count, last - first));
+                let finding = Finding::new_unrated("rate of joints messages", hertz(count, last - first));
                 findings.push(finding.with_paper_value(PAPER_BROADCAST_HZ));
             }
             if motion.counts.ticks > 0 {
@@ -195,12 +199,13 @@ impl PageDraft<'_> {
         findings.extend(self.fit_findings());
         let uplink: UplinkCounts =
             self.run.bus_figures.iter().map(|bus_figures| bus_figures.table.uplink()).sum();
-        let lost = zero_required_finding("packets of cells lost, by their own count".to_owned(), uplink.lost);
+        let lost = zero_required_finding("lost packets of cells, by their own count".to_owned(), uplink.lost);
         findings.push(lost.with_command(self.worst_loss_command(|loss| loss.packets)));
         findings.extend(self.stuck_cells_finding());
         Section::new("summary", "In numbers").with_findings(findings).with_paragraph(
             "Compared with the paper (Efficient Distributed Torque Computation for Large Scale Robot Skin). Numbers within \
-             5 % of the paper's count as the same. The commands show the recording where a number is worst.",
+             5 % of the paper's count as the same. Each command shows the moment of the recording at which a number \
+             is worst.",
         )
     }
 
@@ -208,8 +213,10 @@ impl PageDraft<'_> {
     fn stuck_cells_finding(&self) -> Option<Finding> {
         let cells = self.run.bus_figures.iter().flat_map(|bus_figures| {
             let name = |cell: &CellState| {
-                let kinds: Vec<_> =
-                    cell.stuck_word_runs().map(|(kind, count)| format!("{count} times one {kind}")).collect();
+                let kinds: Vec<_> = cell
+                    .stuck_word_runs()
+                    .map(|(kind, words)| format!("{words} equal {kind} words"))
+                    .collect();
                 (!kinds.is_empty())
                     .then(|| format!("{} {}: {}", bus_figures.name, cell.node, kinds.join(", ")))
             };
@@ -227,8 +234,8 @@ impl PageDraft<'_> {
 
     /// Returns a sentence about a part that only a recording of a run has; `None` for such a recording.
     fn missing_sentence(&self, what: &str) -> Option<String> {
-        let frames_only = self.run.frames_only.as_ref()?;
-        Some(format!("Not in {}: {what}.", frames_only.noun))
+        self.run.frames_only.as_ref()?;
+        Some(format!("This capture does not contain {what}."))
     }
 
     /// Returns the command that shows the loss with the highest count.

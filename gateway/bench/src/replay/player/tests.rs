@@ -197,7 +197,7 @@ fn what_a_bus_does_not_take_is_counted_by_its_reason() {
     assert_eq!(stage.unsent, [(0, 0), (0, 1)]);
     assert_eq!(
         played.failure.map(|why| why.to_string()).as_deref(),
-        Some("vcan0 was removed while it was in use: make it again and open it again")
+        Some("vcan0 was removed while it was in use: create it again, then open it again")
     );
     assert_eq!(stage.sent.len(), 5, "nothing is sent after the end");
 }

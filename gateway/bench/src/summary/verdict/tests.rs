@@ -58,12 +58,13 @@ fn look_at(change: impl FnOnce(&mut Summary)) -> Vec<String> {
 #[test]
 fn a_run_without_any_fault_is_well() {
     assert_eq!(Verdict::new(&well()), Verdict { well: true, look_at: Vec::new() });
-    let sums = "253 cells, 575 of 575 epochs complete, 17772 replies in time, error 6.2e-5 Nm";
+    let sums = "253 cells, 575 of 575 epochs complete, 17772 replies in time, mean error 6.2e-5 Nm";
     assert_eq!(well().totals_line(), sums);
     assert!(Verdict::new(&Summary { outcome: Outcome::Interrupted, ..well() }).well);
 
     assert!(Verdict::new(&well_in_sums()).well);
-    let sums = "253 cells, 575 of 575 epochs complete, 900 cells due in sums in time, error 3.5e-3 Nm";
+    let sums =
+        "253 cells, 575 of 575 epochs complete, 900 contributions to sums in time, mean error 3.5e-3 Nm";
     assert_eq!(well_in_sums().totals_line(), sums);
 
     let mut two = well();
@@ -94,7 +95,7 @@ fn nothing_is_well_that_is_not_known() {
     });
     assert_eq!(
         untouched,
-        ["no torque was due: no cell was in contact, so nothing was compared; --scenario FILE touches cells"]
+        ["no torque was due, because no cell was in contact: use --scenario FILE to touch cells"]
     );
     let distributed = look_at(|it| it.accuracy.single = TorqueErrors::default());
     assert!(
@@ -102,9 +103,9 @@ fn nothing_is_well_that_is_not_known() {
         "{distributed:?}"
     );
     let no_figures = look_at(|it| it.cells[2].bus = "vcan1".to_owned());
-    assert_eq!(no_figures, ["cell 3 on vcan1: the run has no figures of this bus"]);
+    assert_eq!(no_figures, ["cell 3 on vcan1: the run has no results of this bus"]);
     let nan = look_at(|it| it.accuracy.single = [f64::NAN].into_iter().collect());
-    assert!(nan[0].starts_with("mean error of single cells NaN"), "{nan:?}");
+    assert!(nan[0].starts_with("the mean error of the cells' torques is NaN"), "{nan:?}");
 }
 
 /// The beginning of the expected finding, and the change of a good run that causes it.
@@ -124,13 +125,13 @@ const CASES: &[Case] = &[
         let cells = vec![ErrorCells { bus: "vcan0".to_owned(), nodes: vec![7, 8] }];
         it.cell_errors.push(CellError { reason: "no memory".to_owned(), cells });
     }),
-    ("vcan0 was lost 2 times for 1.2 s in all, also at the end: ", |it| {
+    ("vcan0 was lost 2 times for 1.2 s in total, also at the end: ", |it| {
         it.buses[0].outages = OutagesSummary { times: 2, lost_s: 1.2, at_end: true, ticks: 600 };
     }),
     ("cells 1-3, 9 on vcan0: stopped sending, or never sent", |it| {
         it.buses[0].silent_cells = vec![1, 2, 3, 9]
     }),
-    ("host cells: gone once for 0.5 s in all, not reached at the end, 1 frame lost; ", |it| {
+    ("host cells: unreachable once for 0.5 s in total, unreachable at the end, 1 frame lost; ", |it| {
         let name = "cells".to_owned();
         it.buses[0].hosts.push(HostSummary {
             name,
@@ -140,57 +141,63 @@ const CASES: &[Case] = &[
             ..HostSummary::default()
         });
     }),
-    ("12 replies missing for no known reason (unknown) on vcan0: ", |it| {
+    ("12 replies missing on vcan0 for no known reason (unknown): ", |it| {
         it.buses[0].replies.in_time -= 12;
         it.buses[0].replies.unknown = 12;
     }),
-    ("1 packet sent by cells and not received, for no known reason (unknown), on vcan0", |it| {
+    ("1 packet of cells on vcan0 lost for no known reason (unknown): ", |it| {
         it.buses[0].uplink.unknown = 1;
     }),
-    ("5 of 900 cells due in sums were missing on vcan0: ", |it| {
+    ("5 of 900 contributions to sums were missing on vcan0: ", |it| {
         let contributions = Contributions { due: 900, in_time: 895, missing: 5, ..Contributions::default() };
         it.buses[0].sums = Some(SumsSummary { contributions, ..SumsSummary::default() });
     }),
     ("cell 4 on vcan0: no route to a root at the end", |it| network(it).unreachable = vec![4]),
-    ("vcan0 is not as the skin describes it: cell 2 has no wire", |it| {
+    ("vcan0 differs from the skin: cell 2 has no wire", |it| {
         network(it).differences.push("cell 2 has no wire".to_owned());
     }),
     ("cell 5 on vcan0: mean error above 9.8e-4 Nm", |it| it.cells[4].error = [2e-3].into_iter().collect()),
-    ("mean error of single cells 2.0e-3 Nm", |it| it.accuracy.single = [2e-3].into_iter().collect()),
-    ("mean error of sums 2.9e-2 Nm", |it| it.accuracy.sums = [0.029].into_iter().collect()),
+    ("the mean error of the cells' torques is 2.0e-3 Nm, but ", |it| {
+        it.accuracy.single = [2e-3].into_iter().collect()
+    }),
+    ("the mean error of the sums is 2.9e-2 Nm, but ", |it| it.accuracy.sums = [0.029].into_iter().collect()),
     ("3 torques saturated: ", |it| count(it, "saturated", 3)),
     ("cell 6 on vcan0: stuck", |it| _ = it.cells[5].stuck.insert("torque", 40)),
-    ("4 torques of cells that were not touched", |it| it.buses[0].replies.unexpected = 4),
+    ("4 torques on vcan0 not compared", |it| it.buses[0].replies.unexpected = 4),
     ("cells 7, 9 on vcan0: restarted", |it| [6, 8].into_iter().for_each(|at| it.cells[at].restarts = 1)),
-    ("the robot was halted once and resumed; the first reason: a halt frame", |it| {
+    ("the robot was halted once and resumed; the reason for the first halt: a halt frame", |it| {
         it.halts.insert(0, halt(0.5, Some(0.6)));
     }),
-    ("the recording is incomplete, it lacks 2 frames and 1 other message: ", |it| {
+    ("the recording is incomplete: it lacks 2 frames and 1 other message, ", |it| {
         let messages_lost = [("ticks", 1)].into();
         it.recording =
             Some(RecordingAccount { lost: 2, lost_queue: 2, messages_lost, ..RecordingAccount::default() });
     }),
-    ("replies missing on vcan0: 3 lost on the way to the gateway, 1 in doubt", |it| {
+    ("replies missing on vcan0: 3 lost on the way to the gateway, 1 uncertain", |it| {
         it.buses[0].replies.in_time -= 4;
         (it.buses[0].replies.lost, it.buses[0].replies.in_doubt) = (3, 1);
     }),
-    ("packets of cells on vcan0: 4 dropped by the bus, ", |it| {
+    ("packets from cells on vcan0: 4 dropped by the bus, ", |it| {
         it.buses[0].uplink.dropped = 4;
         it.buses[0].dropped_by_bus = 4;
     }),
     ("cell 10 on vcan0: contact unknown", |it| it.cells[9].contact_unknown = 1),
     ("cell 11 on vcan0: in mode \"measure\"", |it| it.cells[10].mode = Some("measure")),
-    ("2 bad cycles, most of them because the torque is not valid", |it| {
+    ("2 bad control cycles, mostly because the torque is not valid", |it| {
         _ = it.control.bad_cycles.insert("the torque is not valid".to_owned(), 2);
     }),
-    ("3 frames of the gateway were not sent: ", |it| it.control.unsent = 3),
-    ("9 late and 2 skipped by cells that received the joints too late of 17772 replies on vcan0: ", |it| {
-        let replies = &mut it.buses[0].replies;
-        replies.in_time -= 11;
-        (replies.late, replies.too_late, replies.skipped) = (8, 1, 2);
-    }),
+    ("the gateway could not send 3 frames, ", |it| it.control.unsent = 3),
     (
-        "8 of 1008 ticks of the control loop skipped, 1 of them with a joints message: this machine was busy (SCHED_FIFO was refused)",
+        "17772 replies due on vcan0: 9 late, 2 skipped, because the cells received the joints too late; ",
+        |it| {
+            let replies = &mut it.buses[0].replies;
+            replies.in_time -= 11;
+            (replies.late, replies.too_late, replies.skipped) = (8, 1, 2);
+        },
+    ),
+    (
+        "the control loop skipped 8 of 1008 ticks, 1 of them with a joints message: this machine was busy \
+         (SCHED_FIFO was refused)",
         |it| {
             (it.control.ticks, it.control.ticks_skipped, it.control.broadcasts_skipped) = (1_000, 8, 1);
         },
@@ -255,7 +262,7 @@ fn the_error_of_a_file_says_what_to_do_with_it_and_no_other_hint_does() {
     let both = failure(2, &["r.mcap: no room", taken]);
     assert_eq!(
         both,
-        format!("the recording is incomplete, 2 frames were not written: r.mcap: no room; {taken}")
+        format!("the recording is incomplete: 2 frames were not written: r.mcap: no room; {taken}")
     );
     assert!(failure(2, &["r.mcap: no room"]).ends_with("repair it with `skinbus recover r.mcap.part`"));
 }
@@ -293,7 +300,10 @@ fn every_loss_is_looked_at() {
         assert_eq!(found.len(), 1, "{at}: {found:?}");
     }
     assert_eq!(look_at(|it| it.buses[0].dropped_by_bus = 1).len(), 1, "of joints, for example");
-    assert_eq!(look_at(|it| it.buses[0].epochs_complete -= 1), ["1 of 575 epochs not complete on vcan0"]);
+    assert_eq!(
+        look_at(|it| it.buses[0].epochs_complete -= 1),
+        ["1 of 575 epochs were not complete on vcan0"]
+    );
     assert_eq!(look_at(|it| it.control.records_lost = 1).len(), 1);
     for event in FrameEvent::ALL {
         assert_eq!(look_at(|it| count(it, event.name(), 1)).len(), 1, "{event:?}");
@@ -312,14 +322,11 @@ fn torques_in_sums_are_checked_too() {
         (parts.in_time, parts.late) = (890, 10);
     });
     assert!(
-        late.len() == 1 && late[0].starts_with("10 of 900 cells due in sums were late on vcan0"),
+        late.len() == 1 && late[0].starts_with("10 of 900 contributions to sums were late on vcan0"),
         "{late:?}"
     );
     let unasked = change(|it| it.buses[0].sums.as_mut().unwrap().contributions.unasked = 2);
-    assert!(
-        unasked.len() == 1 && unasked[0].starts_with("2 torques of cells that were not touched"),
-        "{unasked:?}"
-    );
+    assert!(unasked.len() == 1 && unasked[0].starts_with("2 torques on vcan0 not compared"), "{unasked:?}");
     let never = change(|it| it.buses[0].network.as_mut().unwrap().tree_ready_s = None);
     assert_eq!(never, ["the tree on vcan0 was not complete when the run began"]);
 }

@@ -17,7 +17,7 @@ const MAX_RESTARTS_PER_CHECK: usize = 4;
 /// The maximum time that a cell which waits for a processor takes to process a frame; beyond it, the whole group is
 /// repeated.
 const FRAME_PROCESSING_MARGIN: Span = Span::from_millis(100);
-const CLAIM_OVER_REMARK: &str = "the bench was late each time: the claim was over";
+const CLAIM_OVER_REMARK: &str = "this computer was late in every attempt and sent after the end of the claim";
 
 /// Returns the earliest end of a cell's claim, from the time of its first heartbeat.
 fn earliest_claim_end(session: &Session<'_>, claimed: Micros) -> Micros {
@@ -59,7 +59,8 @@ fn send_ignored_packets(session: &mut Session<'_>, after_test_mode: bool) -> Res
         .unwrap_or_default();
     let presses = state.has(State::TEST_MODE);
     session.check("CONF-9", presses == after_test_mode || !session.about.test_mode, || {
-        "test mode must have the same initial value after each restart, but kept an earlier one".to_owned()
+        "test mode must have the same initial value after each restart, but the cell kept an earlier value"
+            .to_owned()
     });
     session.begin_expected_exchange();
     session.send_stimulus(arm::press_with_sum(4_096))?;
@@ -103,7 +104,7 @@ fn send_ignored_packets(session: &mut Session<'_>, after_test_mode: bool) -> Res
     let came = session.answers().iter().filter(|it| it.at < end);
     let came: Vec<_> = came.map(|it| it.message.id().kind.name()).collect();
     session.check("CLAIM-2", came.is_empty(), || {
-        format!("a claiming cell must not answer requests, but sent {}", came.join(", "))
+        format!("a claiming cell must not answer requests, but it sent {}", came.join(", "))
     });
     let at = settled(session, claimed)?;
     if at.is_none() {
@@ -114,7 +115,7 @@ fn send_ignored_packets(session: &mut Session<'_>, after_test_mode: bool) -> Res
     session.known.hash = session.known.parameters.map(|it| it.hash());
     let is_on = session.exchange_messages(&[])?.state().has(State::TEST_MODE);
     session.check("CLAIM-2", is_on == presses, || {
-        "a claiming cell must ignore a write of parameter 5, but obeyed it".to_owned()
+        "a claiming cell must ignore a write of parameter 5, but it executed the write".to_owned()
     });
     let counters = session.counters()?;
     let is_so = counters.heard.joints == 2 && counters.heard.torques == 0;
@@ -145,7 +146,7 @@ fn send_ignored_packets(session: &mut Session<'_>, after_test_mode: bool) -> Res
 pub(super) fn check_keeps_node_id(session: &mut Session<'_>) -> Result<(), StopReason> {
     let own = session.about.serial.unwrap_or_default();
     let Some(higher) = own.checked_add(1) else {
-        session.findings.mark_not_tested("CLAIM-3", "no serial number is higher than its own");
+        session.findings.mark_not_tested("CLAIM-3", "there is no serial number higher than that of the cell");
         return Ok(());
     };
     let Some(claimed) = claim_during_start(session, higher)? else { return Ok(()) };
@@ -158,7 +159,7 @@ pub(super) fn check_keeps_node_id(session: &mut Session<'_>) -> Result<(), StopR
         if at + Span::from_millis(20) >= end {
             session.findings.mark_not_tested(
                 "CLAIM-3",
-                "claims with a higher serial number: the cell had stopped claiming",
+                "claims with a higher serial number, because the cell had stopped claiming",
             );
             break;
         }
@@ -168,16 +169,18 @@ pub(super) fn check_keeps_node_id(session: &mut Session<'_>) -> Result<(), StopR
         let answer = session.answers().iter().find_map(|it| Some((it.at, it.heartbeat_and_epoch()?.0.state)));
         session.mark_packets_expected();
         session.check("CLAIM-3", came, || {
-            format!("a claiming cell must answer a claim with the higher serial number {serial}, but did not")
+            format!(
+                "a claiming cell must answer a claim with the higher serial number {serial}, but it did not"
+            )
         });
         if let Some((answered, state)) = answer {
             session.record_answer_time("heartbeat to a claimant", at, answered);
             let is_so = state.has(State::CLAIMING_NODE_ID) || answered >= end;
             session.check("CLAIM-3", is_so, || {
-                "a claiming cell must set CLAIMING in its answer to a claim, but it is clear".to_owned()
+                "a claiming cell must set CLAIMING in its answer to a claim, but the bit is clear".to_owned()
             });
             session.check("CLAIM-7", state.has(State::DUPLICATE), || {
-                "a claiming cell must set DUPLICATE in its answer to a claim, but it is clear".to_owned()
+                "a claiming cell must set DUPLICATE in its answer to a claim, but the bit is clear".to_owned()
             });
         }
         session.receive_for(Span::from_millis(30))?;
@@ -185,7 +188,7 @@ pub(super) fn check_keeps_node_id(session: &mut Session<'_>) -> Result<(), StopR
     session.begin_expected_exchange();
     let at = settled(session, claimed)?;
     session.check("CLAIM-3", at.is_some(), || {
-        "the cell must not give way to a higher serial number, but did".to_owned()
+        "the cell must not give way to a claim with a higher serial number, but it did".to_owned()
     });
     session.known.hash = None;
     session.prepare_cell(&arm::example_parameters(2))?;
@@ -206,7 +209,8 @@ fn claim_during_start(session: &mut Session<'_>, higher: u32) -> Result<Option<M
         let Some(claimed) = claimed else {
             session.check("CLAIM-3", false, || {
                 format!(
-                    "the cell must not give way to claims with the higher serial number {higher}, but sent no heartbeat"
+                    "the cell must not give way to claims with the higher serial number {higher}, but it \
+                     sent no heartbeat"
                 )
             });
             return Ok(None);
@@ -222,11 +226,13 @@ fn claim_during_start(session: &mut Session<'_>, higher: u32) -> Result<Option<M
         let is_answered = new.count() > 1;
         if is_set && is_answered || !is_long || attempt == MAX_CHECK_ATTEMPTS {
             session.check("CLAIM-7", is_set || !is_long, || {
-                "DUPLICATE must be set in the first heartbeat if claims came before it, but is clear"
+                "DUPLICATE must be set in the first heartbeat if claims arrived before it, but the bit is \
+                 clear"
                     .to_owned()
             });
             session.check("CLAIM-3", is_answered || !is_long, || {
-                "claims that came before the first heartbeat must be answered, but were not".to_owned()
+                "the cell must answer claims that arrive before its first heartbeat, but it did not"
+                    .to_owned()
             });
             return Ok(Some(claimed));
         }
@@ -248,7 +254,7 @@ pub(super) fn check_invalid_page_ignored(session: &mut Session<'_>) -> Result<()
     session.send(&frames)?;
     let at = settled(session, claimed)?;
     session.check("CLAIM-3", at.is_some(), || {
-        "the cell must ignore a 4nn of a page that does not exist, but gave way to it".to_owned()
+        "the cell must ignore a network packet (4nn) with an unknown page, but it gave way to it".to_owned()
     });
     let is_set = session
         .answers()
@@ -256,7 +262,7 @@ pub(super) fn check_invalid_page_ignored(session: &mut Session<'_>) -> Result<()
         .filter_map(CellPacket::heartbeat_and_epoch)
         .any(|(beat, _)| beat.state.has(State::DUPLICATE));
     session.check("COUNT-1", !is_set, || {
-        "DUPLICATE must not be set by a 4nn of a page that does not exist, but is set".to_owned()
+        "a network packet (4nn) with an unknown page must not set DUPLICATE, but the bit is set".to_owned()
     });
     session.known.hash = None;
     Ok(())
@@ -300,10 +306,12 @@ fn check_silent_after_giving_way(
     session.mark_packets_expected();
     let serial = session.about.serial.unwrap_or_default();
     session.check("CLAIM-3", came == 0, || {
-        format!("the cell (serial number {serial}) must give way to {what}, but sent {came} packets after it")
+        format!(
+            "the cell (serial number {serial}) must give way to {what}, but it sent {came} packets after it"
+        )
     });
     session.check("CLAIM-4", came == 0, || {
-        format!("the cell must be silent after it gave way to {what}, but sent {came} packets")
+        format!("the cell must be silent after it gave way to {what}, but it sent {came} packets")
     });
     Ok(())
 }

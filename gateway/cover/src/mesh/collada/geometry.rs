@@ -203,7 +203,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
             let offset = text.trim().parse().ok().filter(|offset| *offset < MAX_INDICES_PER_CORNER);
             let offset = offset.ok_or_else(|| {
                 self.error(&format!(
-                    "an input has the offset {text:?}; allowed is 0 to {}",
+                    "an input has the offset {text:?}, which must be 0 to {}",
                     MAX_INDICES_PER_CORNER - 1
                 ))
             })?;

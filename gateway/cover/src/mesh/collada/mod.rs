@@ -38,7 +38,7 @@ pub(super) fn triangles(name: &str, bytes: &[u8], up: UpAxis) -> Result<Vec<Tria
     })?;
     let root = document.root_element();
     if root.tag_name().name() != "COLLADA" {
-        return Err(syntax(name, &format!("its first element is {}, not COLLADA", root.tag_name().name())));
+        return Err(syntax(name, &format!("its root element is {}, not COLLADA", root.tag_name().name())));
     }
     let names = ElementIds::from_nodes(name, root.descendants());
     let mut reader = SceneReader { name, names, geometry: HashMap::new(), visited: 0, triangles: Vec::new() };
@@ -89,7 +89,7 @@ fn asset_transform(name: &str, root: Node<'_, '_>, up: UpAxis) -> Result<Affine,
         None => 1.0,
         Some(meter) => {
             let parsed = meter.trim().parse::<f64>().ok().filter(|value| value.is_finite() && *value > 0.0);
-            parsed.ok_or_else(|| syntax(name, &format!("its unit is {meter:?} m, which is not above 0")))?
+            parsed.ok_or_else(|| syntax(name, &format!("its unit is {meter:?} m, which must be above 0")))?
         }
     };
     let axis = asset.and_then(|asset| child(asset, "up_axis")?.text()).map_or("Y_UP", str::trim);
@@ -100,7 +100,7 @@ fn asset_transform(name: &str, root: Node<'_, '_>, up: UpAxis) -> Result<Affine,
         // x becomes z, y becomes -x, and z becomes -y: X_UP has y to the left, and z towards the viewer.
         (UpAxis::Follow, "X_UP") => Matrix3::new(0.0, -1.0, 0.0, 0.0, 0.0, -1.0, 1.0, 0.0, 0.0),
         (UpAxis::Follow, _) => {
-            return Err(syntax(name, &format!("its up_axis is {axis:?}, none of X_UP, Y_UP and Z_UP")));
+            return Err(syntax(name, &format!("its up_axis is {axis:?}, not X_UP, Y_UP or Z_UP")));
         }
     };
     Ok(Affine { linear: turn * scale, shift: Vector3::zeros() })
@@ -129,7 +129,7 @@ impl<'a, 'i> ElementIds<'a, 'i> {
     fn find(&self, kind: &str, reference: &str) -> Result<Option<Node<'a, 'i>>, MeshError> {
         let wrong = |reason: String| Err(syntax(self.file, &reason));
         let Some(id) = reference.strip_prefix('#') else {
-            return wrong(format!("its {kind} {reference:?} is not in this file; write all into one file"));
+            return wrong(format!("its {kind} {reference:?} is in another file; write all into one file"));
         };
         match self.elements.get(&(kind, id)).map_or(&[][..], Vec::as_slice) {
             [] => Ok(None),
@@ -167,7 +167,7 @@ impl<'a, 'i> SceneReader<'a, 'i> {
         self.visited += 1;
         if depth > MAX_DEPTH || self.visited > MAX_NODES {
             return Err(self.error(&format!(
-                "its nodes are nested more than {MAX_DEPTH} deep, or more than {MAX_NODES}"
+                "its nodes are nested more than {MAX_DEPTH} deep, or there are more than {MAX_NODES}"
             )));
         }
         let mut here = *outer;
@@ -190,7 +190,9 @@ impl<'a, 'i> SceneReader<'a, 'i> {
                 // The vertices of a controller are moved by joints, which are not read.
                 "instance_controller" => {
                     let url = element.attribute("url").unwrap_or_default();
-                    return Err(self.error(&format!("controller {url:?} deforms a mesh; apply it first")));
+                    return Err(
+                        self.error(&format!("controller {url:?} deforms a mesh; apply the deformation"))
+                    );
                 }
                 _ => (),
             }

@@ -84,7 +84,7 @@ fn nodes_and_scenes_are_found_by_kind_and_missed_in_words() {
     assert_eq!(places(&mesh), [2.0]);
     for (nodes, words) in [
         (r##"<node><instance_node url="#b"/></node>"##, "node \"#b\" does not exist"),
-        (r#"<node><instance_node url="b.dae#a"/></node>"#, "its node \"b.dae#a\" is not in this file"),
+        (r#"<node><instance_node url="b.dae#a"/></node>"#, "its node \"b.dae#a\" is in another file"),
         (r##"<node><instance_controller url="#c"/></node>"##, "controller \"#c\" deforms a mesh"),
     ] {
         let error = parse(&file(&shape, nodes, library)).unwrap_err();

@@ -33,7 +33,7 @@ fn the_period_is_read_and_holds_all_touches() {
     );
     assert_eq!(
         with("touches_repeat_s = 3.5"),
-        "s.toml:21: touch[0].for_s = 1.6: the touch must end before touches_repeat_s = 3.5, when all begin again"
+        "s.toml:21: touch[0].for_s = 1.6: the touch must end before all touches repeat at touches_repeat_s = 3.5"
     );
     let endless = format!("{GOOD}[[touch]]\nat_s = 4.0\ncells = [2]\nforce_n = 1.0\n");
     let read = |period: &str| {
@@ -46,7 +46,7 @@ fn the_period_is_read_and_holds_all_touches() {
     assert!(read("4.5").is_ok(), "it lasts until all begin again");
     assert_eq!(
         by_line(read("4.0").unwrap_err()),
-        "s.toml:49: touch[2].at_s = 4: the touch must end before touches_repeat_s = 4, when all begin again"
+        "s.toml:49: touch[2].at_s = 4: the touch must end before all touches repeat at touches_repeat_s = 4"
     );
 }
 

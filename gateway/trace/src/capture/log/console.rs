@@ -330,7 +330,7 @@ impl<'a> Cursor<'a> {
             if !swap {
                 self.skip_blanks();
             }
-            let missing = self.expected_error("a data byte: there are fewer than the length says");
+            let missing = self.expected_error("a data byte, because there are fewer than the length states");
             let digits = self.take_while(|byte| byte.is_ascii_hexdigit());
             *place = byte(digits).ok_or(missing)?;
         }
@@ -341,7 +341,7 @@ impl<'a> Cursor<'a> {
         self.skip_blanks();
         let further = LineError {
             column: self.at + 1,
-            expected: "the end: there are more data bytes than the length says",
+            expected: "the end of the data, because there are more bytes than the length states",
         };
         let is_near = self.at <= from + 1;
         if is_near && byte(Self { ..*self }.take_word()).is_some() { Err(further) } else { Ok(data) }

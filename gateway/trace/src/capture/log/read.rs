@@ -402,7 +402,7 @@ mod tests {
 
     #[test]
     fn bytes_that_are_no_text_are_a_fault_only_in_a_frame() {
-        let fault = NoteKind::Unreadable("column 2: seconds since 1970".to_owned());
+        let fault = NoteKind::Unreadable("column 2: expected seconds since 1970".to_owned());
         assert_eq!(all(b"(\xff\n\xff\n", 100), [(1, b"(\xff".to_vec(), fault), text(2, b"\xFF")]);
     }
 

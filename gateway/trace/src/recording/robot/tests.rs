@@ -75,10 +75,12 @@ fn a_urdf_of_another_robot_is_refused() {
     let mut other = skin(0.5);
     other.robot.joints[0].name = "elbow".to_owned();
     let error = arm(&other).unwrap_err().to_string();
-    assert_eq!(error, "arm.urdf: there is no moving joint \"elbow\"; the nearest are \"grip\" or \"hinge\"");
+    assert_eq!(error, "arm.urdf: there is no moving joint \"elbow\"; similar names: \"grip\" or \"hinge\"");
     let error = arm(&skin(0.6)).unwrap_err().to_string();
     assert!(
-        error.starts_with("arm.urdf: the link behind joint \"hinge\" is not where chain \"upper\""),
+        error.starts_with(
+            "arm.urdf: the URDF and chain \"upper\" of the skin place the link behind joint \"hinge\""
+        ),
         "{error}"
     );
     assert!(RecordedRobot::from_rows(&skin(0.6)).is_ok());

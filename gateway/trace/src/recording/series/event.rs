@@ -23,7 +23,8 @@ impl core::fmt::Display for RecordingEvent {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         let more = match self {
             Self::BrokeOff(_) => {
-                ": the run goes on without it; what was recorded so far stays readable, what comes now is counted"
+                ": the run continues without it; the data recorded so far stays readable, and later data is only \
+                 counted"
             }
             Self::Other(_) => "",
         };

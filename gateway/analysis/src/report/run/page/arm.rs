@@ -51,16 +51,15 @@ impl PageDraft<'_> {
                     papers("Q7.8", paper::SUMMED_ERROR_NM),
                 ])
         });
-        let mut section = Section::new("torque", "Torque, and its difference from the central one");
+        let mut section = Section::new("torque", "Torque, and its difference from the central computation");
         if !loaded.is_empty() {
             let when = if self.run.frames_only.is_some() { "before each broadcast" } else { "at each tick" };
             section = section.with_paragraph(format!("The upper curve is the sum of the torques received {when}. The lower curve is the \
              difference, once per epoch, between the sum of all cells' answers and the central computation for the same joints; an epoch without an \
              answer in time is a gap. Dotted lines: one step of the torque words."));
             let is_compared = self.run.bus_figures.iter().any(|it| it.lines.error.point_count() > 0);
-            let lacks = self.missing_sentence(
-                "stimuli or sensors from which central torques, and the difference to them, follow",
-            );
+            let lacks =
+                self.missing_sentence("the stimuli or sensors from which central torques are computed");
             section.text.extend(lacks.filter(|_| !is_compared));
         }
         if !free.is_empty() {
@@ -195,7 +194,7 @@ impl PageDraft<'_> {
             [paper::SINGLE_CELL_ERROR_NM, paper::SUMMED_ERROR_NM].map(|mean| format_quantity(mean, "Nm"));
         let papers = ["paper", &single, "", "", &whole, "", ""].map(str::to_owned).into();
         Some(Table::new(
-            "Absolute errors, joint by joint: single cells where the joint carries them, and the whole skin's sum",
+            "Absolute torque errors by joint: of single cells that load the joint, and of the sum over the whole skin",
             ["", "single cells: mean", "max", "torques", "whole skin: mean", "max", "epochs"],
             joints.chain([all, papers]),
         ))
@@ -258,13 +257,15 @@ impl PageDraft<'_> {
         let title = "Active cells: cells in the torque sum, and cells in contact";
         let figure = self
             .time_figure("active-cells", title, Axis::new("cells", ""))
-            .draw_series("in the torque", SeriesShape::Steps, self.points(&motion.contributing))
+            .draw_series("in the torque sum", SeriesShape::Steps, self.points(&motion.contributing))
             .draw_series("in contact, by the central computation", SeriesShape::Steps, active)
             .with_marks(self.marks());
         let mut section = Section::new("cells", "Active cells");
         section.text.extend(
-            self.missing_sentence("stimuli or sensors of all cells, and so which are in contact")
-                .filter(|_| !is_known),
+            self.missing_sentence(
+                "the stimuli or sensors of all cells, which show which cells are in contact",
+            )
+            .filter(|_| !is_known),
         );
         if has_only_zeros(&figure) {
             let none =
@@ -288,16 +289,16 @@ impl PageDraft<'_> {
                 .with_series(series)
                 .with_marks(self.marks())
         };
-        let took = [("tick", &motion.took.line), ("central computation in it", &motion.central_took.line)];
+        let took = [("tick", &motion.took.line), ("central computation", &motion.central_took.line)];
         let figures = [
-            figure("cycle", "Duration of each tick, and of the central computation in it", &took),
-            figure("lateness", "How late each tick began", &[("", &motion.late.line)]),
+            figure("cycle", "Duration of each tick, and of its central computation", &took),
+            figure("lateness", "Lateness of each tick", &[("", &motion.late.line)]),
         ];
         let rows = [
-            ("tick began late", &motion.late.times),
-            ("tick took", &motion.took.times),
-            ("central computation in it", &motion.central_took.times),
-            ("tick without central computation", &motion.plain),
+            ("lateness of a tick", &motion.late.times),
+            ("duration of a tick", &motion.took.times),
+            ("central computation in a tick", &motion.central_took.times),
+            ("duration of a tick without central computation", &motion.plain),
         ];
         let rows = rows.into_iter().map(|(name, times)| (name, times.histogram()));
         let row = |(name, histogram): (&str, &Histogram<u64>)| {
@@ -310,7 +311,7 @@ impl PageDraft<'_> {
             .map(|key| self.run.metadata_value("machine", key));
         if let [Some(p50), Some(p99), Some(max)] = idle {
             let [p50, p99, max] = [p50, p99, max].map(format_micros);
-            let name = "the idle machine's thread woke late".to_owned();
+            let name = "lateness of a wake-up on the idle machine".to_owned();
             rows.push(vec![name, p50, String::new(), p99, max, String::new()]);
         }
         let head = ["", "median", "90 %", "99 %", "max", "values"];

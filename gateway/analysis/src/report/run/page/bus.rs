@@ -21,8 +21,8 @@ impl PageDraft<'_> {
         let due = self.run.bus_figures.iter().filter(|bus_figures| bus_figures.reply_counts().due > 0);
         let mut section = Section::new("replies", "Replies")
             .with_paragraph(
-                "A reply is due from every cell that is configured, awake and in contact; it is in time before the next \
-                 joints, late within three more.",
+                "A reply is due from every cell that is configured, awake and in contact; it is in time if it \
+                 arrives before the next joints message, and late if it arrives within three more periods.",
             )
             .with_figures(due.flat_map(|bus_figures| self.reply_figures(bus_figures)).filter_map(without_empty_series))
             .with_tables([self.reply_account_table()])
@@ -34,7 +34,7 @@ impl PageDraft<'_> {
         };
         for (which, sentence) in [
             (&none_due as &dyn Fn(&&BusFigures) -> bool, "no reply was due"),
-            (&complete, "every reply that was due came in time"),
+            (&complete, "every reply that was due arrived in time"),
         ] {
             let names: Vec<_> =
                 self.run.bus_figures.iter().filter(which).map(|it| it.name.as_str()).collect();
@@ -63,7 +63,7 @@ impl PageDraft<'_> {
             [("late", &bus_figures.lines.late), ("missing", &bus_figures.lines.missing)],
         ];
         let mut figures = vec![steps("replies", "due and in time, epoch by epoch", y.clone(), due)];
-        figures.extend((lost > 0).then(|| steps("late", "late and missing, once known", y, late)));
+        figures.extend((lost > 0).then(|| steps("late", "late and missing, when it became known", y, late)));
         let slowest = self.time_figure(format!("slowest-{name}"), slowest, Axis::new("time", "ms"));
         let slowest = slowest.with_series([self.thinned_series("", &bus_figures.lines.slowest)]);
         figures.push(if lost > 0 { slowest } else { slowest.with_half_width() });
@@ -97,7 +97,7 @@ impl PageDraft<'_> {
             "late",
             "missing",
             "epochs due",
-            "complete",
+            "epochs complete",
             "last reply: median",
             "99 %",
             "max",
@@ -187,7 +187,10 @@ impl PageDraft<'_> {
     /// rated only if the bit rates were chosen, not for defaults.
     pub(super) fn fit_findings(&self) -> Vec<Finding> {
         let mut findings = Vec::new();
-        let limits = format!("at most 100 %, replies before the next joints, {MAX_NODES_PER_BUS} nodes");
+        let limits = format!(
+            "load at most 100 %, replies before the next joints message, at most \
+                              {MAX_NODES_PER_BUS} nodes"
+        );
         for bus in self.bus_shadows() {
             let bus_figures = self.run.bus_figures.iter().find(|bus_figures| bus_figures.name == bus.bus);
             let origin = bus_figures.and_then(|bus_figures| bus_figures.rates_from);
@@ -229,7 +232,8 @@ impl PageDraft<'_> {
         let mut section = Section::new("load", "Load of the buses").with_paragraph(text);
         if assumed {
             section = section.with_paragraph(
-                "The skin does not give bit rates for every bus; common ones are shown for information.",
+                "The skin does not give bit rates for every bus; for the others, common bit rates are assumed, and \
+                 the load is only for information.",
             );
         }
         section
@@ -270,12 +274,12 @@ impl PageDraft<'_> {
                 );
             }
         }
-        row("packets of any network in the kernel's backlog".to_owned(), run.backlog, false);
+        row("packets of any network that the kernel's backlog dropped".to_owned(), run.backlog, false);
         row("frames of buses that the skin does not have".to_owned(), run.others, false);
         row("messages or lines that cannot be read".to_owned(), run.unreadable, false);
         let mut section = Section::new("losses", "Losses")
             .with_paragraph("Rows of possible losses are always shown; other rows only when they are not 0.");
-        section.text.extend(self.missing_sentence("skipped ticks and bad cycles"));
+        section.text.extend(self.missing_sentence("the counts of skipped ticks and bad cycles"));
         section.with_tables(self.loss_table()).with_tables([Table::new(
             "All counts",
             ["what", "count"],
@@ -302,7 +306,7 @@ fn load_table(bus: &BusShadow) -> Table {
     }
     if let Some(start) = &bus.start_up {
         let frames =
-            format!("{} frames in {} without joints", start.frames, format_quantity(start.duration_s, "s"));
+            format!("{} frames in {}, without joints", start.frames, format_quantity(start.duration_s, "s"));
         let [second, short] =
             [start.load.worst_1_s, start.load.worst_16_ms].map(|it| format_percent(it.value));
         row(["start-up", "", &share(start.load.mean), &second, &short, &frames]);
@@ -310,7 +314,7 @@ fn load_table(bus: &BusShadow) -> Table {
     if bus.counts.bench.total() > 0 {
         row(["left out", "", "", "", "", &format!("{} bench-only frames", bus.counts.bench.total())]);
     }
-    let head = ["", "verdict", "load on average", "in any second", "in any 16 ms", "what"];
+    let head = ["", "verdict", "load on average", "in any second", "in any 16 ms", "details"];
     Table::new(format!("Fit of {} at {}", bus.bus, bus.name), head, rows)
 }
 

@@ -40,12 +40,12 @@ impl FormatComparison<'_> {
         match (best == used, beyond) {
             (true, _) => None,
             (false, 0) => Some(format!(
-                "{bus}: {name} would have fitted better: it holds every torque too, and rounds by {costs} instead of \
-                 {instead} on average."
+                "{bus}: the torque format {name} would have been better: it also covers every torque, and its mean \
+                 rounding error is {costs} instead of {instead}."
             )),
             (false, _) => Some(format!(
-                "{bus}: {name} would have fitted better: {beyond} torques are beyond {}, the range of {}. It rounds by \
-                 {costs} instead of {instead} on average.",
+                "{bus}: the torque format {name} would have been better: {beyond} torques are beyond {}, the range \
+                 of {}. Its mean rounding error is {costs} instead of {instead}.",
                 format_quantity(used.upper_bound(), "Nm"),
                 used.name(),
             )),
@@ -101,8 +101,8 @@ impl PageDraft<'_> {
         let rows: Vec<_> = rows.collect();
         (!rows.is_empty()).then(|| {
             Table::new(
-                "Torque formats: the central torques of single cells, rounded to each",
-                ["", "range", "beyond it", "rounding: mean", "max"],
+                "Torque formats: central torques of single cells, rounded to each format",
+                ["", "range", "torques beyond it", "rounding error: mean", "max"],
                 rows,
             )
         })

@@ -52,7 +52,7 @@ impl PageDraft<'_> {
                 WeightedMoment { at: from, weight: force * cells as f64, what }
             }));
         }
-        self.moment_table("Touches, cells of a link together", all, further)
+        self.moment_table("Touches, grouped by link", all, further)
     }
 
     /// Creates the table of losses, and of cells that fell silent, came back or restarted.
@@ -78,7 +78,7 @@ impl PageDraft<'_> {
                     Notice::Duplicate(node) => {
                         format!("{name}: cell {node} received packets of another cell with its node id")
                     }
-                    Notice::OtherGateway => format!("{name}: another gateway sends"),
+                    Notice::OtherGateway => format!("{name}: another gateway sends on this bus"),
                     Notice::Returned(_) => return None,
                 };
                 Some(WeightedMoment { at: *at, weight: f64::INFINITY, what })

@@ -35,11 +35,17 @@ impl PageDraft<'_> {
         let loss = self.cell_map("map-losses", title, "losses", "", &losses);
         let section = match (self.touch_strip(), force) {
             (Some(strip), Some(force)) => section
-                .with_paragraph("A force is that of Algorithm 1 on the cell's sensors, from the joints at which it was latched to the next.")
+                .with_paragraph(
+                    "Algorithm 1 computes each force from the cell's sensors; the force holds from the joints message \
+                     that latched it to the next one.",
+                )
                 .with_drawings([Drawing::Strip(strip), Drawing::Map(force)])
                 .with_tables(self.touch_table()),
             (..) if self.lacks_forces() => section.with_paragraph(
-                self.missing_sentence("stimuli or sensors of the cells that sent torques, and so the forces on them").unwrap_or_default(),
+                self.missing_sentence(
+                    "the stimuli or sensors of the cells that sent torques, which show the forces on them",
+                )
+                .unwrap_or_default(),
             ),
             (..) => section.with_paragraph("The frames show no touch of a cell."),
         };
