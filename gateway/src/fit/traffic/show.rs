@@ -158,7 +158,7 @@ fn add_operation_rows(rows: &mut KeyValueTable, bus: &BusShadow) {
 
 /// Adds rows on the start-up, for which no limits apply.
 fn add_start_up_rows(rows: &mut KeyValueTable, bus: &BusShadow, start_up: &StartUpFigures) {
-    let beside = format!("{} frames in {:.3} s, without joints", start_up.frames, start_up.duration_s);
+    let beside = format!("{} frames, {:.3} s before joints", start_up.frames, start_up.duration_s);
     add_load_rows(rows, bus, &start_up.load, ("start-up: average load", &beside));
     add_busy_stretch_row(rows, bus, &start_up.stretches);
     rows.add_row("  delay, µs", format_delays(&start_up.delay_us), "50 % / 99 % / max");
