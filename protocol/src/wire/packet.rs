@@ -259,9 +259,13 @@ impl Packet {
 
     /// Returns the CRC, for a packet whose bytes are in several frames.
     fn checksum(&self) -> u16 {
-        let mut bytes = [0; MAX_BYTES - 2];
-        self.write_pairs(bytes.as_chunks_mut::<2>().0, 0);
-        checksum(self.id, bytes.get(..self.words.length().bytes() - 2).unwrap_or_default())
+        let mut digest = CRC.digest();
+        digest.update(&self.id.to_bits().to_le_bytes());
+        for word in self.words.as_slice() {
+            digest.update(&word.to_le_bytes());
+        }
+        digest.update(&[self.epoch.0, self.count]);
+        digest.finalize()
     }
 
     /// Returns the frames that carry this packet, as [`write_frame`](Self::write_frame) writes them.
