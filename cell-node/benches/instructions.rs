@@ -64,7 +64,7 @@ fn nalgebra_f32(cell: &BenchSetting) -> [f32; MAX_JOINTS] {
 }
 
 #[library_benchmark]
-fn seventh_order() -> i16 {
+fn by_eighths() -> i16 {
     fold_full_circle(sine::sine)
 }
 
@@ -90,7 +90,7 @@ library_benchmark_group!(
     compare_by_id = true;
     benchmarks = wrench, projection, nalgebra_f64, nalgebra_f32
 );
-library_benchmark_group!(name = sines; benchmarks = seventh_order, fifth_order);
+library_benchmark_group!(name = sines; benchmarks = by_eighths, fifth_order);
 library_benchmark_group!(name = replies; benchmarks = reply_to_joints);
 
 /// Runs each benchmark once and checks its result.

@@ -19,8 +19,8 @@ use oracle::{Case, Errors};
 fn main() {
     println!("Sine over all 65 536 angles (Q1.14; rounding alone: mean 1.52e-5)\n");
     println!("| function | mean error | max error |\n|---|---|---|");
-    print_sine_errors("sine, seventh order", sine, f64::sin);
-    print_sine_errors("cosine, seventh order", cosine, f64::cos);
+    print_sine_errors("sine, by eighths of a turn", sine, f64::sin);
+    print_sine_errors("cosine, by eighths of a turn", cosine, f64::cos);
     print_sine_errors("sine, fifth order (paper)", paper_sine, f64::sin);
     print_sine_errors("cosine, fifth order (paper)", paper_cosine, f64::cos);
 

@@ -15,6 +15,7 @@ use protocol::can::Format;
 use protocol::id::{CellId, Kind};
 use protocol::packet;
 use protocol::port::{LinkId, PORTS};
+use protocol::sine::SineMethod;
 use protocol::time::{Micros, Span};
 
 use crate::flash::FlashState;
@@ -50,6 +51,7 @@ pub type PortLinkIds = [Option<LinkId>; PORTS + 1];
 pub struct HostedCells {
     cells: Vec<HostedCell>,
     format: Format,
+    sine: SineMethod,
     clock: Clock,
     subscriptions: Subscriptions,
     /// True if the identifiers that the cells receive may have changed since the filters were set.
@@ -102,12 +104,13 @@ pub enum StopReason {
 }
 
 impl HostedCells {
-    /// Creates an empty set of cells for a bus with this frame format.
+    /// Creates an empty set of cells for a bus with this frame format. The cells compute with this sine.
     #[must_use]
-    pub fn new(format: Format) -> Self {
+    pub fn new(format: Format, sine: SineMethod) -> Self {
         Self {
             cells: Vec::new(),
             format,
+            sine,
             clock: Clock::new(),
             subscriptions: Subscriptions::default(),
             subscriptions_changed: false,
@@ -134,7 +137,9 @@ impl HostedCells {
             wired |= 1 << port;
             self.subscriptions.subscribe_port(link_id.reversed(), self.cells.len(), port);
         }
-        let node = Node::new(identity, self.format, flash, true, self.clock.now()).with_ports(wired);
+        let node = Node::new(identity, self.format, flash, true, self.clock.now())
+            .with_sine(self.sine)
+            .with_ports(wired);
         self.cells.push(HostedCell { node, file, link_ids });
         self.subscriptions_changed = true;
     }

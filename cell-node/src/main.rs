@@ -11,6 +11,7 @@ use clap::Parser;
 use protocol::bus::{BusKind, KindChoice};
 use protocol::id::CellId;
 use protocol::last_words::{CellRange, ExitReason};
+use protocol::sine::SineMethod;
 use protocol::skin::{BusWires, Skin, SkinReply};
 use rustix::process::{Pid, Signal, getppid, set_parent_process_death_signal};
 
@@ -50,7 +51,11 @@ struct Arguments {
     reconnect: bool,
     #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto, help = BusKind::help())]
     bus_kind: KindChoice,
-    /// Exit when this parent process ends
+    /// Compute with the sine of this build, eighths, or with that of earlier builds, seventh-order. The last bits of
+    /// torques depend on it, which `skinbus replay` compares
+    #[arg(long, value_name = "NAME", default_value_t)]
+    sine: SineMethod,
+    /// Exit when the parent process with this id ends
     #[arg(long, value_name = "PID")]
     with_parent: Option<i32>,
 }
@@ -143,7 +148,7 @@ fn prepare_cells(arguments: &Arguments) -> Result<(HostedCells, Sockets, BusPort
         SkinReply::Sum { .. } => Some(skin.wires(bus_index)),
     };
     let (first, last) = arguments.node_range().context("--node or --nodes is needed")?;
-    let mut cells = HostedCells::new(bus.format);
+    let mut cells = HostedCells::new(bus.format, arguments.sine);
     for number in first..=last {
         start_cell(&mut cells, arguments, &skin, bus_index, wires.as_ref(), CellId::new(number.into())?)?;
     }

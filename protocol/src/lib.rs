@@ -10,7 +10,7 @@ mod skin_file;
 mod wire;
 
 #[cfg(feature = "host")]
-pub use shell::{input, last_words, stop, usage};
+pub use shell::{input, last_words, sine, stop, usage};
 #[cfg(feature = "host")]
 pub use skin_file::{document, skin, xml};
 #[cfg(feature = "host")]

@@ -15,6 +15,11 @@ pub trait Scalar: Copy {
 
     /// Converts an element of J from the number that the kernel computes with to the type that it returns.
     fn from_number(number: Self::Number) -> Self;
+    /// Returns the number as a word, if this type is the cell's [`Q1_14`]. Assembly computes with this type only.
+    #[must_use]
+    fn cell_word(_number: Self::Number) -> Option<Q1_14> {
+        None
+    }
 }
 
 /// A number type for kernels, with the wider type of its sums of products.
@@ -94,6 +99,12 @@ pub trait Number: Copy + Debug + PartialEq {
     fn norm_upper_bound(vector: [Self; 3]) -> Option<u32>;
     /// Returns sine and cosine of an angle in quarter turns.
     fn sine_cosine(angle: Q1_14) -> [Self; 2];
+    /// Returns sine and cosine as cells of earlier builds computed them.
+    #[cfg(feature = "earlier-sine")]
+    #[must_use]
+    fn seventh_order_sine_cosine(angle: Q1_14) -> [Self; 2] {
+        Self::sine_cosine(angle)
+    }
     /// Adds two angles in quarter turns. The sum wraps into one turn.
     #[must_use]
     fn add_angles(lhs: Q1_14, rhs: Q1_14) -> Q1_14 {
@@ -110,12 +121,15 @@ pub trait Number: Copy + Debug + PartialEq {
 
 /// A 16-bit number in the format Q1.14, for computations with [`FixedPoint`].
 pub trait Word: Copy + Debug + PartialEq {
+    /// True for the cell's own word, [`Q1_14`].
+    const IS_CELL_WORD: bool = false;
+
     /// Creates the number from a word.
     fn from_word(word: Q1_14) -> Self;
     /// Returns the number as a word.
     fn to_word(self) -> Q1_14;
     /// Returns sine and cosine of an angle in quarter turns, in steps of 2^-14. The default is the
-    /// seventh-order polynomial.
+    /// cell's sine.
     #[must_use]
     fn sine_cosine(angle: Q1_14) -> [i32; 2] {
         sine_cosine(angle)
@@ -145,6 +159,8 @@ pub struct Operations {
 
 /// The cell's number type.
 impl Word for Q1_14 {
+    const IS_CELL_WORD: bool = true;
+
     fn from_word(word: Q1_14) -> Self {
         word
     }
@@ -159,8 +175,11 @@ impl<W: Word> Scalar for W {
 
     #[inline]
     fn from_number(number: FixedPoint<W>) -> Self {
-        let [low, high, ..] = number.steps.to_le_bytes();
-        Self::from_word(Q1_14::from_bits(i16::from_le_bytes([low, high])))
+        Self::from_word(number.to_word())
+    }
+
+    fn cell_word(number: FixedPoint<W>) -> Option<Q1_14> {
+        W::IS_CELL_WORD.then(|| number.to_word())
     }
 }
 
@@ -176,6 +195,12 @@ impl<W> FixedPoint<W> {
     #[inline]
     const fn new(steps: i32) -> Self {
         Self { steps, of: PhantomData }
+    }
+
+    #[inline]
+    fn to_word(&self) -> Q1_14 {
+        let [low, high, ..] = self.steps.to_le_bytes();
+        Q1_14::from_bits(i16::from_le_bytes([low, high]))
     }
 
     /// Converts a sum in steps of 2^-28 to steps of 2^-14, with saturation. The caller has added half a step of 2^-14
@@ -328,6 +353,11 @@ impl<W: Word> Number for FixedPoint<W> {
     fn sine_cosine(angle: Q1_14) -> [Self; 2] {
         W::record_operation(|done| (done.sines, done.cosines) = (done.sines + 1, done.cosines + 1));
         W::sine_cosine(angle).map(Self::new)
+    }
+
+    #[cfg(feature = "earlier-sine")]
+    fn seventh_order_sine_cosine(angle: Q1_14) -> [Self; 2] {
+        crate::sine::seventh_order::seventh_order_sine_cosine(angle).map(Self::new)
     }
 
     #[inline]

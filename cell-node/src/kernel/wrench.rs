@@ -17,15 +17,24 @@
 //! prismatic joint, as are fixed rows right below it: they are folded into the six stored words. Components
 //! that no row further down reads are not computed: [`UsedComponents`] tracks them, once per configuration.
 
+#[cfg(armv6m)]
+mod cortex_m0;
 mod due;
 mod fold;
 mod range;
+mod turn;
+mod variant;
 
 use protocol::fixed::{Q1_14, TorqueFormat};
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
+#[cfg(feature = "earlier-sine")]
+use protocol::sine::SineMethod;
 
 use self::fold::constant_wrench;
 use self::range::moment_bound;
+#[cfg(feature = "earlier-sine")]
+use self::turn::SeventhOrderSine;
+use self::turn::{CellSine, Rotation, SineFunction};
 use super::joint::Joint;
 use super::rounding::{NonSaturatingRounding, Rounding, SaturatingRounding};
 use super::{
@@ -51,6 +60,10 @@ pub struct Wrench<S: Scalar = Q1_14> {
     bound: u16,
     /// The conversion of the torques for this J to words.
     rounding: TorqueRounding,
+    #[cfg(armv6m)]
+    program: cortex_m0::Program,
+    #[cfg(feature = "earlier-sine")]
+    sine: SineMethod,
 }
 
 /// A force of one newton and its moment in m (Nm per N), or one property of each of their components.
@@ -116,6 +129,10 @@ impl<S: Scalar> Wrench<S> {
             rows: 0,
             bound: MAX_JACOBIAN_STEPS,
             rounding: TorqueRounding::new(TorqueFormat::default(), MAX_JACOBIAN_STEPS),
+            #[cfg(armv6m)]
+            program: cortex_m0::Program::NONE,
+            #[cfg(feature = "earlier-sine")]
+            sine: SineMethod::default(),
         }
     }
 
@@ -154,6 +171,8 @@ impl<S: Scalar> Wrench<S> {
         self.rounding = TorqueRounding::new(parameters.torque_format, self.bound);
         self.joint = if rows == 0 { 0 } else { parameters.joint.into() };
         (self.contact, self.rows) = (contact, rows);
+        #[cfg(armv6m)]
+        self.prepare_program();
     }
 }
 
@@ -166,14 +185,42 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
 
     #[inline(always)]
     fn write_jacobian(&self, joints: &[Q1_14; MAX_JOINTS], jacobian: &mut [S; MAX_JOINTS]) {
+        #[cfg(armv6m)]
+        if self.program.write_jacobian(joints, jacobian) {
+            return;
+        }
+        self.write_jacobian_in_rust(joints, jacobian);
+    }
+}
+
+impl<S: Scalar> Wrench<S> {
+    // Where assembly does the work, the registers that this code needs are not to be saved for it.
+    #[cfg_attr(armv6m, cold, inline(never))]
+    #[cfg_attr(not(armv6m), inline(always))]
+    fn write_jacobian_in_rust(&self, joints: &[Q1_14; MAX_JOINTS], jacobian: &mut [S; MAX_JOINTS]) {
+        #[cfg(feature = "earlier-sine")]
+        if self.sine == SineMethod::SeventhOrder {
+            cold_path();
+            return self.write_jacobian_with::<SeventhOrderSine>(joints, jacobian);
+        }
+        self.write_jacobian_with::<CellSine>(joints, jacobian);
+    }
+
+    #[inline(always)]
+    fn write_jacobian_with<F: SineFunction>(
+        &self,
+        joints: &[Q1_14; MAX_JOINTS],
+        jacobian: &mut [S; MAX_JOINTS],
+    ) {
         let links = self.links.get(..self.rows).unwrap_or_default();
-        if self.bound < MAX_JACOBIAN_STEPS {
-            write_jacobian_bounded(self.contact, links, joints, jacobian);
+        // Assembly has left nearly all chains without a bound; the code for the others saves flash.
+        if self.bound < MAX_JACOBIAN_STEPS && !cfg!(armv6m) {
+            write_jacobian_bounded::<F, S>(self.contact, links, joints, jacobian);
         } else {
             let moving = jacobian.get_mut(..self.joint).unwrap_or_default().iter_mut().rev();
             let positions = joints.get(..self.joint).unwrap_or_default().iter().rev();
             cold_path();
-            write_jacobian_saturating(self.contact, links, moving, positions);
+            write_jacobian_saturating::<F, S>(self.contact, links, moving, positions);
         }
     }
 }
@@ -181,7 +228,7 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
 /// Carries the wrench of the contact down to the base and writes J, without saturation. It is for chains of revolute
 /// joints and fixed rows in which no number can leave the range of a word.
 #[inline(always)]
-fn write_jacobian_bounded<S: Scalar>(
+fn write_jacobian_bounded<F: SineFunction, S: Scalar>(
     mut wrench: PerComponent<S::Number>,
     links: &[ChainLink<S::Number>],
     joints: &[Q1_14; MAX_JOINTS],
@@ -198,7 +245,7 @@ fn write_jacobian_bounded<S: Scalar>(
         let [.., moment] = wrench.moment;
         *row = S::from_number(moment);
         let Some(next) = links.next() else { return };
-        link.turn_about_z::<NonSaturatingRounding>(&mut wrench, *position);
+        link.turn_about_z::<F, NonSaturatingRounding>(&mut wrench, *position);
         link = next;
         if link.has_due_bit(due::HAS_TWIST_OR_NO_JOINT) {
             while link.has_due_bit(due::HAS_NO_JOINT) {
@@ -216,7 +263,7 @@ fn write_jacobian_bounded<S: Scalar>(
 
 /// Like [`write_jacobian_bounded`], with saturation, for any chain.
 #[inline(never)]
-fn write_jacobian_saturating<'a, S: Scalar + 'a>(
+fn write_jacobian_saturating<'a, F: SineFunction, S: Scalar + 'a>(
     mut wrench: PerComponent<S::Number>,
     links: &[ChainLink<S::Number>],
     mut moving: impl Iterator<Item = &'a mut S>,
@@ -245,7 +292,7 @@ fn write_jacobian_saturating<'a, S: Scalar + 'a>(
         }
         match link.kind {
             RowKind::Revolute if link.has_due_bit(due::TURN_RESULTS_MASK) => {
-                link.turn_about_z::<SaturatingRounding>(&mut wrench, position)
+                link.turn_about_z::<F, SaturatingRounding>(&mut wrench, position)
             }
             RowKind::Revolute => {}
             RowKind::Prismatic | RowKind::Fixed => link.turn_by_offset(&mut wrench),
@@ -395,8 +442,8 @@ impl<N: Number> ChainLink<N> {
     /// Transforms the wrench by `Rz(theta)` of a revolute joint at this position. Computes only the components that are
     /// read later.
     #[inline(always)]
-    fn turn_about_z<R: Rounding>(&self, wrench: &mut PerComponent<N>, position: Q1_14) {
-        let turn = Rotation(N::sine_cosine(N::add_angles(position, self.offset)));
+    fn turn_about_z<F: SineFunction, R: Rounding>(&self, wrench: &mut PerComponent<N>, position: Q1_14) {
+        let turn = Rotation::new(F::sine_cosine(N::add_angles(position, self.offset)));
         if self.has_due_bit(due::ALL_TURN_RESULTS_READ) {
             turn.rotate_all_components::<R>(wrench);
         } else {
@@ -409,7 +456,7 @@ impl<N: Number> ChainLink<N> {
         if let Some(turn) = self.constant
             && self.has_due_bit(due::TURN_RESULTS_MASK)
         {
-            Rotation(turn).rotate_due_components::<SaturatingRounding>(wrench, self.due);
+            Rotation::new(turn).rotate_due_components::<SaturatingRounding>(wrench, self.due);
         }
     }
 
@@ -418,51 +465,6 @@ impl<N: Number> ChainLink<N> {
     fn apply_fixed_row(&self, wrench: &mut PerComponent<N>) {
         self.twist_and_shift::<SaturatingRounding>(wrench, self.offset_d());
         self.turn_by_offset(wrench);
-    }
-}
-
-/// A rotation `Rz`, given by its sine and cosine.
-struct Rotation<N>([N; 2]);
-
-impl<N: Number> Rotation<N> {
-    #[inline(always)]
-    fn rotated_x<R: Rounding>(&self, x: N, y: N) -> N {
-        let Self([sine, cosine]) = self;
-        R::rounded_difference(cosine.times(x), sine.times(y))
-    }
-
-    #[inline(always)]
-    fn rotated_y<R: Rounding>(&self, x: N, y: N) -> N {
-        let Self([sine, cosine]) = self;
-        R::rounded_sum(sine.times(x), cosine.times(y))
-    }
-
-    #[inline(always)]
-    fn rotate_all_components<R: Rounding>(
-        &self,
-        PerComponent { force: [fx, fy, _], moment: [mx, my, _] }: &mut PerComponent<N>,
-    ) {
-        (*fx, *fy) = (self.rotated_x::<R>(*fx, *fy), self.rotated_y::<R>(*fx, *fy));
-        (*mx, *my) = (self.rotated_x::<R>(*mx, *my), self.rotated_y::<R>(*mx, *my));
-    }
-
-    /// Computes only the results of the turn whose bits are set in `due`.
-    #[inline(always)]
-    fn rotate_due_components<R: Rounding>(&self, wrench: &mut PerComponent<N>, due: u32) {
-        let PerComponent { force: [fx, fy, _], moment: [mx, my, _] } = *wrench;
-        let PerComponent { force: [new_fx, new_fy, _], moment: [new_mx, new_my, _] } = wrench;
-        if due & due::NEEDS_TURNED_FX != 0 {
-            *new_fx = self.rotated_x::<R>(fx, fy);
-        }
-        if due & due::NEEDS_TURNED_FY != 0 {
-            *new_fy = self.rotated_y::<R>(fx, fy);
-        }
-        if due & due::NEEDS_TURNED_MX != 0 {
-            *new_mx = self.rotated_x::<R>(mx, my);
-        }
-        if due & due::NEEDS_TURNED_MY != 0 {
-            *new_my = self.rotated_y::<R>(mx, my);
-        }
     }
 }
 

@@ -39,6 +39,12 @@ impl Configuration {
         Self { is_configured: false, in_use, staged: parameters }
     }
 
+    /// Computes with the sine of another build from now on.
+    #[cfg(feature = "earlier-sine")]
+    pub(super) const fn set_sine(&mut self, sine: protocol::sine::SineMethod) {
+        self.in_use.kernel.set_sine(sine);
+    }
+
     /// Activates the parameters from flash, unless they are invalid.
     pub(super) fn restore_parameters(&mut self, parameters: &Parameters) {
         if parameters.check().is_ok() {

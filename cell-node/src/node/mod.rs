@@ -141,6 +141,14 @@ impl Node {
         }
     }
 
+    /// Makes the cell compute with the sine of another build, for replays.
+    #[cfg(feature = "earlier-sine")]
+    #[must_use]
+    pub fn with_sine(mut self, sine: protocol::sine::SineMethod) -> Self {
+        self.configuration.set_sine(sine);
+        self
+    }
+
     /// Connects the ports of the cell to wires: bit p is set if port p has a wire, and bit 4 if the cell has a wire to
     /// the gateway's side.
     #[must_use]

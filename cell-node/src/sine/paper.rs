@@ -4,7 +4,8 @@ use core::f64::consts::FRAC_PI_2;
 
 use protocol::fixed::Q1_14;
 
-use super::{ONE_Q16, QUARTER_TURN, evaluate_odd_polynomial, evaluate_sine_cosine};
+use super::odd_polynomial::{ONE_Q16, evaluate_sine_cosine};
+use super::word_within_one;
 
 /// The paper's polynomial (Eq. 13, 16): `a z - b z^3 + c z^5` with a = pi/2, c = pi/2 - 3/2, and b such that
 /// the sum is one.
@@ -22,16 +23,18 @@ const fn round_to_q16(constant: f64) -> i32 {
 /// Returns the paper's sine (Eq. 17, 18), fifth order, in [-1, 1].
 ///
 /// The mean error over all angles is below 1.9e-4, and the maximum below 4.6e-4: ten times those of
-/// [`sine`](super::sine), for one multiplication less.
+/// [`sine`](super::sine).
 #[must_use]
 pub fn paper_sine(angle: Q1_14) -> Q1_14 {
-    evaluate_odd_polynomial(angle, FIFTH_ORDER_COEFFICIENTS)
+    let [sine, _] = paper_sine_cosine(angle);
+    word_within_one(sine)
 }
 
 /// Returns the paper's cosine (Eq. 19): [`paper_sine`] a quarter turn later.
 #[must_use]
 pub fn paper_cosine(angle: Q1_14) -> Q1_14 {
-    paper_sine(angle.wrapping_add(QUARTER_TURN))
+    let [_, cosine] = paper_sine_cosine(angle);
+    word_within_one(cosine)
 }
 
 /// Returns [`paper_sine`] and [`paper_cosine`] of one angle in steps of 2^-14.

@@ -58,7 +58,7 @@ impl SineError {
 /// Writes the section on the error of the sine.
 #[must_use]
 pub fn sine_section() -> Section {
-    let [fifth, seventh, rounded] = [
+    let [fifth, eighths, rounded] = [
         SineError::of_function(paper_sine),
         SineError::of_function(sine),
         SineError::of_function(|angle| Q1_14::nearest(angle.to_radians().sin())),
@@ -74,8 +74,8 @@ pub fn sine_section() -> Section {
     Section::new("sine", "The sine in 16 bits")
         .with_paragraph(
             "The figures show the difference from the sine in double precision, over all 65 536 angles of a 16-bit \
-             word. The paper gives a mean error for the polynomial of fifth order. Cells use the polynomial of \
-             seventh order, which needs one more multiplication. The lowest curve is the error of rounding to Q1.14 \
+             word. The paper gives a mean error for the polynomial of fifth order. Cells use short \
+             polynomials of the distance from the nearest quarter turn. The lowest curve is the error of rounding to Q1.14 \
              alone.",
         )
         .with_figures([
@@ -86,14 +86,14 @@ pub fn sine_section() -> Section {
             ),
             figure("sine-max", "Maximum error in each of 256 parts of the circle", "maximum error")
                 .draw_series("fifth order", SeriesShape::Steps, fifth.parts.clone())
-                .draw_series("seventh order, used by the cells", SeriesShape::Steps, seventh.parts.clone())
+                .draw_series("by eighths of a turn, used by the cells", SeriesShape::Steps, eighths.parts.clone())
                 .draw_series("rounding alone", SeriesShape::Steps, rounded.parts.clone()),
         ])
         .with_findings([
             mean("sine of fifth order, mean error", &fifth, 1.9e-4),
             max("sine of fifth order, maximum error", &fifth, 4.6e-4),
-            mean("sine of seventh order, mean error", &seventh, 2e-5),
-            max("sine of seventh order, maximum error", &seventh, 1e-4),
+            mean("sine by eighths of a turn, mean error", &eighths, 2e-5),
+            max("sine by eighths of a turn, maximum error", &eighths, 1e-4),
             Finding::new_unrated("rounding to Q1.14 alone, mean error", rounded.mean),
         ])
 }

@@ -1,13 +1,14 @@
 //! Measurement of the cell's arithmetic on emulated microcontrollers and on the host. `tests/firmware/count` runs it.
 //!
 //! The first task prints, for each case, the words of J and of the torques from both kernels; the words must be the
-//! same on all machines. The second task runs each kernel once per case, while the emulator counts the instructions of
-//! the functions `measure_...`.
+//! same on all machines. The second task does the same for random cells. The third runs each kernel once per case, while the
+//! emulator counts the instructions of the functions `measure_...`.
 #![cfg_attr(target_os = "none", no_std, no_main)]
 
 mod cases;
 mod counted;
 mod machine;
+mod random;
 
 use cases::CASES;
 use cell_node::contact::{MAX_JACOBIAN_STEPS, TorqueRounding};
@@ -29,6 +30,7 @@ fn run(machine: &mut Machine) {
     match machine.task() {
         b'c' => count(machine),
         b's' => stack(machine),
+        b'r' => random::run(machine),
         _ => words(machine),
     }
 }

@@ -17,6 +17,7 @@ use std::time::{Duration, Instant};
 
 use protocol::bus::KindChoices;
 use protocol::last_words::CellRange;
+use protocol::sine::SineMethod;
 use protocol::skin::{Cell, Skin};
 use protocol::usage::path_from_env;
 use rustix::fs::{MemfdFlags, memfd_create};
@@ -220,6 +221,8 @@ pub struct CellLaunch<'a> {
     pub per_process: usize,
     /// Directory for the cells' parameters, if they keep them.
     pub flash: Option<&'a Path>,
+    /// The sine with which the cells compute.
+    pub sine: SineMethod,
 }
 
 impl Processes {
@@ -399,6 +402,7 @@ impl CellLaunch<'_> {
         command.arg("--skin").arg(self.skin_file).arg("--reconnect");
         command.args(["--bus-kind", &self.kinds.kind_of(bus).to_string()]);
         command.args(["--with-parent", &std::process::id().to_string()]);
+        command.args(["--sine", self.sine.name()]);
         if let Some(flash) = self.flash {
             command.arg("--flash").arg(flash);
         }

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::process::ExitStatus;
 
 use protocol::bus::{BusError, KindsError};
+use protocol::sine::UnknownSineMethod;
 use thiserror::Error;
 
 use crate::error::{RunError, reason_suffix};
@@ -63,6 +64,14 @@ pub enum ReplayError {
     /// An error that runs can have too: of a skin, a bus, a program or a thread.
     #[error(transparent)]
     Run(RunError),
+    /// The recording names a sine that this build does not have.
+    #[error(
+        "the recording's cells computed with another sine: {error}; replay it with the build that recorded it"
+    )]
+    Sine {
+        /// The unknown name.
+        error: UnknownSineMethod,
+    },
     /// A bus cannot have the kind that is named for it.
     #[error(transparent)]
     Kinds(#[from] KindsError),
@@ -212,6 +221,7 @@ impl ReplayError {
             | Self::MapTwice(_)
             | Self::Merged
             | Self::NoSkin(_)
+            | Self::Sine { .. }
             | Self::NotOfSkin { .. } => 2,
             Self::Read(_)
             | Self::Line(_)

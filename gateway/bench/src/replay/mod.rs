@@ -25,6 +25,7 @@ pub mod replay_plan;
 pub mod report;
 mod session;
 mod shared_state;
+mod sine;
 mod source;
 mod start;
 pub mod survey;
@@ -37,6 +38,7 @@ use std::time::Duration;
 use protocol::bus::KindChoices;
 use protocol::id::CellId;
 use protocol::input::is_standard_input;
+use protocol::sine::SineMethod;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use self::checks::CellChecks;
@@ -47,6 +49,7 @@ use self::replay_plan::SenderFilter;
 use self::report::Summary;
 use self::session::ReplaySession;
 use self::shared_state::SharedState;
+use self::sine::RecordedSine;
 use self::start::BusRoutes;
 use self::survey::{Survey, TimeRange};
 use crate::bus::realtime::idle_lateness;
@@ -114,6 +117,26 @@ pub struct ReplayOptions {
 /// Returns [`ReplayError`] if the replay cannot start or the capture cannot be read to its end. Problems on the buses
 /// and in the comparison are in the summary.
 pub fn replay(options: &ReplayOptions) -> Result<Summary, ReplayError> {
+    let (first, sine) = replay_with_sine(options, None)?;
+    let Some(RecordedSine::Assumed(assumed)) = sine.filter(|_| first.has_other_torque_words()) else {
+        return Ok(first);
+    };
+    let other = if assumed == SineMethod::Eighths { SineMethod::SeventhOrder } else { SineMethod::Eighths };
+    let progress = Progress::notes_only(options.quiet);
+    progress.print_note(&format!(
+        "{} does not state the sine of its cells, and {assumed} gives different torques: replaying it again with {other}",
+        first.file
+    ));
+    let (second, _) = replay_with_sine(options, Some(other))?;
+    Ok(if second.differs_less_than(&first) { second } else { first })
+}
+
+/// Replays a capture once. The cells that it starts compute with `sine`; with `None`, with that of the recorded cells.
+/// Also returns the sine of these cells.
+fn replay_with_sine(
+    options: &ReplayOptions,
+    sine: Option<SineMethod>,
+) -> Result<(Summary, Option<RecordedSine>), ReplayError> {
     let progress = Progress::notes_only(options.quiet);
     let (survey, extras, name) = survey_capture(options, &progress)?;
     let routes = BusRoutes::new(options, &survey, &name)?;
@@ -132,15 +155,21 @@ pub fn replay(options: &ReplayOptions) -> Result<Summary, ReplayError> {
     let sends_joints = options.only != SenderFilter::Replies && survey.buses.iter().any(|bus| bus.joints > 0);
     let present = if sends_joints { buses.find_cells()? } else { Vec::new() };
     let checks = CellChecks { options: options.clone(), survey, routes, name };
+    let mut started_sine = None;
     if let (Some(spawn), Some(skin_override)) = (&options.spawn, &skin_override) {
-        buses.start_cells(spawn, skin_override, &present)?;
+        let sine = match sine {
+            Some(sine) => RecordedSine::Known(sine),
+            None => sine::recorded_sine(options, &extras, &skin_override.skin)?,
+        };
+        buses.start_cells(spawn, skin_override, &present, sine.method())?;
+        started_sine = Some(sine);
     } else if options.only == SenderFilter::All {
         warn_of_duplicates(&checks, &present, &progress);
     }
     let shared_state = Arc::new(SharedState::new(checks));
     let (measuring, ended) = (Vec::new(), EndedProcesses::default());
-    ReplaySession { shared_state, buses, signalled, progress, measuring, ended }
-        .run(idle.as_ref(), skin_override.as_ref())
+    let session = ReplaySession { shared_state, buses, signalled, progress, measuring, ended };
+    Ok((session.run(idle.as_ref(), skin_override.as_ref())?, started_sine))
 }
 
 /// Reads the whole capture once. Returns its survey, its contents other than frames, and its display name.

@@ -126,6 +126,18 @@ fn nonzero_counts<const N: usize>(counts: [(&'static str, u64); N]) -> Vec<(&'st
 }
 
 impl Summary {
+    /// Returns true if torques of cells differ from the recorded ones.
+    pub(super) fn has_other_torque_words(&self) -> bool {
+        let tally = self.expect.as_ref().map(|expect| &expect.tally);
+        !self.interrupted && tally.is_some_and(|tally| tally.different > 0 && tally.torque_words.max > 0)
+    }
+
+    /// Returns true if fewer replies differ from the recorded ones than in another replay of the same capture.
+    pub(super) fn differs_less_than(&self, other: &Self) -> bool {
+        let different = |it: &Self| it.expect.as_ref().map_or(u64::MAX, |expect| expect.tally.different);
+        different(self) < different(other)
+    }
+
     /// Returns the reason why the replay failed, in one line, or `None` for success. Reasons that processes gave for
     /// errors of cells are repeated only if `quiet`, because they have been printed otherwise.
     #[must_use]

@@ -11,6 +11,7 @@ use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::message::{Message, Request};
 use protocol::parameters::Parameter;
+use protocol::sine::SineMethod;
 use protocol::skin::Skin;
 
 use super::player::ReplaySpeed;
@@ -252,6 +253,7 @@ impl Buses {
         spawn: &SpawnOptions,
         skin_override: &SpawnSkin,
         heard: &[BTreeSet<CellId>],
+        sine: SineMethod,
     ) -> Result<(), ReplayError> {
         let there = self.bus_links.iter().zip(heard).find(|(_, cells)| !cells.is_empty());
         if let Some((bus_link, cells)) = there {
@@ -270,6 +272,7 @@ impl Buses {
             kinds: &kinds,
             per_process: spawn.cells_per_process,
             flash: None,
+            sine,
         })?;
         Ok(())
     }

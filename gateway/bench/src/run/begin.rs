@@ -10,6 +10,7 @@ use protocol::id::{CellId, Node};
 use protocol::message::Message;
 use protocol::packet::Epoch;
 use protocol::parameters::{Parameter, Sensing};
+use protocol::sine::SineMethod;
 use protocol::time::Span;
 use protocol::usage::eprint_line;
 
@@ -50,6 +51,7 @@ impl Bench<'_> {
                 directory: options.directory.as_deref(),
                 per_process: options.cells_per_process,
                 flash: options.flash.as_deref(),
+                sine: SineMethod::default(),
             })?;
         }
         let cells = options.skin.cells.len();

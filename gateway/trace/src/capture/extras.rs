@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use protocol::can::Frame;
 use protocol::document::DocumentError;
+use protocol::sine::SineMethod;
 use protocol::skin::Skin;
 use serde::Serialize;
 
@@ -28,10 +29,15 @@ pub const RUN_METADATA: &str = "run";
 /// The key of the first tick's time in [`RUN_METADATA`], in ns since 1970.
 const BEGAN_KEY: &str = "began_ns";
 
-/// Returns the contents of the metadata record [`RUN_METADATA`] for a first tick at `nanos` ns since 1970.
+/// The key of the cells' sine in [`RUN_METADATA`]: the name of a [`SineMethod`].
+const SINE_KEY: &str = "sine";
+
+/// Returns the contents of the metadata record [`RUN_METADATA`] for a first tick at `nanos` ns since 1970, and the sine
+/// with which this build's cells compute.
 #[must_use]
 pub fn run_metadata(nanos: u64) -> BTreeMap<String, String> {
-    [(BEGAN_KEY.to_owned(), nanos.to_string())].into()
+    let sine = SineMethod::default().name().to_owned();
+    [(BEGAN_KEY.to_owned(), nanos.to_string()), (SINE_KEY.to_owned(), sine)].into()
 }
 
 /// Returns the time from `zero` to `nanos` in s, both given in ns since 1970. The result is negative if `nanos` is
@@ -68,6 +74,12 @@ impl RecordingExtras {
     #[must_use]
     pub fn run_began(&self) -> Option<u64> {
         self.metadata_value(RUN_METADATA, BEGAN_KEY)?.parse().ok()
+    }
+
+    /// Returns the name of the sine with which the recorded cells computed; `None` if the recording does not state it.
+    #[must_use]
+    pub fn sine_name(&self) -> Option<&str> {
+        self.metadata_value(RUN_METADATA, SINE_KEY)
     }
 
     /// Returns the attached skin; `None` if the recording has none.
