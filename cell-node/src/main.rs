@@ -1,5 +1,6 @@
 //! A process that runs one or several skin cells.
 
+use std::io::{self, Write as _};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -13,6 +14,7 @@ use protocol::id::CellId;
 use protocol::last_words::{CellRange, ExitReason};
 use protocol::sine::SineMethod;
 use protocol::skin::{BusWires, Skin, SkinReply};
+use protocol::usage::{exit_code, ignore_broken_pipe};
 use rustix::process::{Pid, Signal, getppid, set_parent_process_death_signal};
 
 /// Run one or several tactile skin cells, which receive joint positions and answer with joint torques
@@ -99,7 +101,10 @@ fn main() -> ExitCode {
     let arguments = match Arguments::try_parse() {
         Ok(arguments) => arguments,
         // Help and version were requested and are printed unchanged.
-        Err(requested) if !requested.use_stderr() => requested.exit(),
+        Err(requested) if !requested.use_stderr() => {
+            let printed = requested.print().and_then(|()| io::stdout().flush());
+            return exit_code("cell-node", ignore_broken_pipe(printed));
+        }
         Err(wrong) => {
             eprint_line(protocol::usage::one_line_error(&wrong.render().to_string()));
             return ExitCode::from(2);

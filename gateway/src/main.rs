@@ -39,11 +39,12 @@ mod surface;
 mod view;
 mod visuals;
 
+use std::io::{self, Write as _};
 use std::process::ExitCode;
 
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
-use protocol::usage::{Failure, exit_code, one_line_error};
+use protocol::usage::{Failure, exit_code, ignore_broken_pipe, one_line_error};
 
 /// A test bench for robot skin on CAN: runs cells, bridges their bus to a control loop, records, replays
 #[derive(Debug, Parser)]
@@ -116,7 +117,9 @@ fn main() -> ExitCode {
     let done = match parsed {
         Ok(arguments) => arguments.command.run(),
         // Print requested help and version unchanged.
-        Err(requested) if !requested.use_stderr() => requested.exit(),
+        Err(requested) if !requested.use_stderr() => {
+            ignore_broken_pipe(requested.print().and_then(|()| io::stdout().flush()))
+        }
         Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
         Err(wrong) => Err(Failure::usage_error(usage_error(&wrong))),
     };

@@ -327,6 +327,16 @@ fn a_damaged_recording_is_refused_and_leaves_nothing() {
 fn a_full_disk_is_said_and_a_reader_may_leave() {
     let folder = Folder::new(&[]);
     recording(&folder);
+    for command in ["--help", "dump -h"] {
+        let full = fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+        let Output { status, stderr, .. } = folder.gateway(command).stdout(full).output().unwrap();
+        let said = "skinbus: standard output: No space left on device (os error 28)\n";
+        assert_eq!(
+            (status.code(), String::from_utf8(stderr).unwrap().as_str()),
+            (Some(1), said),
+            "{command}"
+        );
+    }
     let said = folder.refuses("convert long.mcap /dev/full", 1);
     assert!(said.starts_with("skinbus: /dev/full: No space left on device"), "{said}");
     let mut child =

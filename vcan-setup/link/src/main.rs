@@ -6,12 +6,13 @@ mod log;
 mod session;
 mod watchers;
 
+use std::io::{self, Write as _};
 use std::os::unix::net::UnixStream;
 use std::process::ExitCode;
 
 use clap::Parser;
 use clap::error::ErrorKind;
-use protocol::usage::{Failure, exit_code, one_line_error, print_text};
+use protocol::usage::{Failure, exit_code, ignore_broken_pipe, one_line_error, print_text};
 use signal_hook::consts::{SIGINT, SIGTERM};
 use vcan_setup::hosts::options::LinkOptions;
 use vcan_setup::hosts::program;
@@ -32,7 +33,9 @@ fn main() -> ExitCode {
         program::check_caller().map_err(Failure::run_error).and_then(|()| match Arguments::try_parse() {
             Ok(arguments) => run(arguments.options),
             // The user requested help or the version; clap prints them.
-            Err(queried) if !queried.use_stderr() => queried.exit(),
+            Err(queried) if !queried.use_stderr() => {
+                ignore_broken_pipe(queried.print().and_then(|()| io::stdout().flush()))
+            }
             Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
             Err(wrong) => Err(Failure::usage_error(one_line_error(&wrong.render().to_string()))),
         });
@@ -59,7 +62,7 @@ fn run(options: LinkOptions) -> Result<(), Failure> {
     let link = HostLink::open(settings).map_err(|error| {
         if error.is_usage() { Failure::usage_error(error) } else { Failure::run_error(error) }
     })?;
-    let ready = format!("{} ({}) is linked as '{host}'", options.bus, link.kind());
+    let ready = format!("{} ({}) is linked under the name '{host}'", options.bus, link.kind());
     if options.json {
         print_to_stderr(&ready)
     } else {
@@ -100,7 +103,7 @@ fn text(report: &LinkReport) -> String {
     text
 }
 
-fn no_signals(error: std::io::Error) -> Failure {
+fn no_signals(error: io::Error) -> Failure {
     Failure::run_error(format!("cannot catch signals: {error}"))
 }
 
