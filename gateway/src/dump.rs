@@ -53,8 +53,8 @@ pub(crate) struct DumpCommand {
     /// recording are read as one, in any order
     #[arg(required = true, value_name = "BUS|FILE")]
     sources: Vec<PathBuf>,
-    /// Show only these kinds of frames: command (or only its halt, joints, sync, resume, report), sum, torque, sensors,
-    /// network, configure, configured, stimulus, wire, foreign (includes damaged), damaged
+    /// Show only frames of these kinds: command, sum, torque, sensors, network, configure, configured, stimulus, wire,
+    /// foreign, damaged; or a single command: halt, joints, sync, resume, report. Kind foreign includes damaged
     #[arg(long, value_name = "KIND", value_delimiter = ',')]
     kind: Vec<FrameSelector>,
     /// Show only packets from or to these nodes: cells, gateway or everyone
@@ -71,7 +71,7 @@ pub(crate) struct DumpCommand {
     /// proximity, heartbeats of active cells
     #[arg(long)]
     contact: bool,
-    /// Show frames from this second of the run on; without a run, seconds count from the first frame
+    /// Show frames from this time on: seconds since the start of the run, or of a log since its first frame
     #[arg(long, value_name = "S", value_parser = parse_time_ns, allow_negative_numbers = true)]
     from: Option<u64>,
     /// Show frames before this second, counted like --from; ends a live dump
@@ -80,7 +80,7 @@ pub(crate) struct DumpCommand {
     /// End after showing or counting this many frames
     #[arg(long, short = 'n', value_name = "COUNT")]
     count: Option<u64>,
-    /// Print the bus and the seconds of the run (or since the first frame) instead of the raw frame
+    /// Print the bus and the time since the start of the run (of a log: since its first frame) instead of the raw frame
     #[arg(long, conflicts_with_all = ["json", "stats"])]
     brief: bool,
     /// Print one JSON object per line; with --stats, one in total
@@ -303,7 +303,9 @@ fn show_live(
     to: Option<u64>,
     stopped: &AtomicBool,
 ) -> Result<(), Failure> {
-    let mut end = None;
+    // A bus on which nothing is sent ends too.
+    let time_limit = |from: Instant| to.map(|to| from + Duration::from_nanos(to));
+    let (mut end, mut has_begun) = (time_limit(Instant::now()), false);
     let done = loop {
         if stopped.load(Ordering::Relaxed) || end.is_some_and(|end| Instant::now() >= end) {
             break Ok(());
@@ -313,11 +315,9 @@ fn show_live(
             Err(failure) => break Err(failure),
             // If the reader of the output has read enough, end the dump without an error.
             Ok(Err(error)) => break ignore_broken_pipe(Err(error)),
-            Ok(Ok(true)) => {
-                // The time of `--to` must also come if no further frames arrive.
-                end = end.or_else(|| Some(Instant::now() + Duration::from_nanos(to?)));
-            }
-            Ok(Ok(false)) => {}
+            // Times count from the first frame.
+            Ok(Ok(true)) if !has_begun => (end, has_begun) = (time_limit(Instant::now()), true),
+            Ok(Ok(_)) => {}
         }
         if show.is_limit_reached() {
             break Ok(());

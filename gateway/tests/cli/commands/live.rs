@@ -4,7 +4,7 @@ use std::io::{BufRead, BufReader, Read, Write};
 use std::path::PathBuf;
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bench::bus::listen::{Listener, send_message};
 use model::decode::Decoded;
@@ -279,7 +279,7 @@ fn what_shows_a_live_bus_ends_when_its_reader_has_enough() {
         }
         drop(child.stdout.take());
         let (bus, resume) = (bench.open(), Message::Resume);
-        let began = std::time::Instant::now();
+        let began = Instant::now();
         let status = loop {
             if let Some(status) = child.try_wait().unwrap() {
                 break status;
@@ -458,4 +458,17 @@ fn a_skin_tells_ack_its_buses_and_formats() {
         frames.extend(inbox.frames().map(|received| received.frame));
     }
     assert_eq!(Message::decode(&packet(&frames, Format::Classic)), Ok(Message::Resume));
+}
+
+#[test]
+fn a_live_dump_of_a_silent_bus_ends_at_its_time() {
+    let bench = Bench::new();
+    for arguments in ["--to 200ms", "--to 200ms --stats"] {
+        let begun = Instant::now();
+        let Output { status, stderr, .. } =
+            bench.gateway(&format!("dump vcan0 {arguments}")).output().unwrap();
+        let took = begun.elapsed();
+        assert_eq!(status.code(), Some(0), "{arguments}: {}", text(&stderr));
+        assert!(took >= Duration::from_millis(200), "{arguments}: {took:?}");
+    }
 }
