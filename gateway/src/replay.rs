@@ -17,8 +17,8 @@ use super::arguments::{
 };
 use super::output::{self, OverwriteOption, check_distinct_files, print_table};
 use super::print::{
-    GREEN, KeyValueTable, RESET_COLOUR, YELLOW, comma_separated, count_with_noun, format_quantiles,
-    hanging_indent, or_else_text, to_pretty_json,
+    GREEN, KeyValueTable, RESET_COLOUR, YELLOW, comma_separated, format_quantiles, hanging_indent,
+    or_else_text, to_pretty_json,
 };
 
 /// Receive buffer in bytes: all cells may answer a report at once.
@@ -60,7 +60,7 @@ pub(crate) struct ReplayCommand {
     /// Speed factor, 0.1 to 100; or max to send as fast as the bus accepts frames, whatever their times
     #[arg(long, value_name = "X", default_value = "1", value_parser = speed, allow_negative_numbers = true)]
     speed: ReplaySpeed,
-    /// Send joints only after every cell has answered the previous ones: gives the same result on any machine
+    /// Send a joints message only after every cell has answered the previous one: gives the same result on any machine
     #[arg(long)]
     lockstep: bool,
     /// Compare the answers with the recorded ones; --speed max then implies --lockstep
@@ -108,8 +108,8 @@ struct FrameOptions {
     /// --lockstep or --spawn, else all
     #[arg(long, value_parser = one_of_values(SENDER_FILTERS))]
     only: Option<SenderFilter>,
-    /// Begin at this second of the run, counted from the first frame if there is no run; if only inputs are
-    /// sent, begin in the state that was latched then
+    /// Begin at this time: seconds since the start of the run, or of a log since its first frame. If only inputs are
+    /// sent, the cells are first brought into the state that they had then
     #[arg(long, value_name = "S", value_parser = parse_time_ns, allow_negative_numbers = true)]
     from: Option<u64>,
     /// End before this second, counted like --from
@@ -174,6 +174,12 @@ impl ReplayCommand {
             (None, Some(_)) => SenderFilter::Inputs,
             (only, _) => only.unwrap_or(SenderFilter::All),
         };
+        if let (Some(from), Some(to)) = (self.frames.from, self.frames.to)
+            && from >= to
+        {
+            let [from, to] = [from, to].map(|nanos| Duration::from_nanos(nanos).as_secs_f64());
+            return Err(Failure::usage_error(format!("--from {from} must be before --to {to}")));
+        }
         let timeout_ms = environment_number("SKINBUS_SEND_TIMEOUT_MS", 1..=60_000)?;
         Ok(ReplayOptions {
             files: self.files.clone(),
@@ -238,7 +244,7 @@ fn table(summary: &Summary, is_coloured: bool) -> String {
     if let Some(lockstep) = &summary.lockstep {
         let silent = comma_separated(&lockstep.silent_cells);
         let silent = if silent.is_empty() { "all answered".to_owned() } else { format!("silent: {silent}") };
-        rows.add_section("lockstep", silent, format!("{} joints retried", lockstep.retried));
+        rows.add_section("lockstep", silent, format!("{} joints messages retried", lockstep.retried));
     }
     if let Some(expect) = &summary.expect {
         comparison_rows(&mut rows, expect);
@@ -259,11 +265,11 @@ fn comparison_rows(rows: &mut KeyValueTable, expect: &ReplyComparison) {
     difference_rows(rows, "sum", &tally.sum_words, 1);
     let late = match expect.joints_skipped {
         0 => String::new(),
-        skipped => format!("cells received joints too late {}", count_with_noun(skipped, "time")),
+        skipped => format!("joints messages that reached cells too late: {skipped}"),
     };
     rows.add_row("missing", tally.missing, late);
     rows.add_row("extra", tally.extra, "");
-    rows.add_row_unless_zero("not requested", tally.not_requested, "a bus refused the joints");
+    rows.add_row_unless_zero("not requested", tally.not_requested, "a bus refused the joints message");
     for (reason, count) in tally.lacking.reason_counts() {
         rows.add_row("not recorded", count, reason);
     }

@@ -114,6 +114,7 @@ fn invalid_input_is_refused_in_one_line() {
             2,
             "skinbus: --from and --to select no frames to send: some.log ends at 2.000 s",
         ),
+        ("some.log --from 2 --to 1", 2, "skinbus: --from 2 must be before --to 1"),
         ("some.log --map can0=can1", 2, "skinbus: --map can0=can1: some.log has no bus can0; it has vcan0"),
         ("some.log --bus can0", 2, "skinbus: --bus can0: some.log has no bus can0; it has vcan0"),
         (
@@ -181,8 +182,8 @@ fn an_unreadable_line_is_named_and_omitted_and_times_that_run_backwards_are_repo
             "odd.log:2: column 4: expected digits of a second",
             "odd.log: lines skipped because they could not be read: 1",
             "odd.log: 7 frames are missing: they were lost during recording",
-            "odd.log: time stamps run backwards, first at frame 3 by 4.100 s: a frame that is older than one already \
-             sent is sent at once",
+            "odd.log: time stamps go backwards (first at frame 3, by 4.100 s): frames that are out of order are sent \
+             immediately",
         ]
     );
     assert_eq!((replayed.number("/sent"), replayed.number("/sent_at_once")), (5, 2), "{:#}", replayed.0);

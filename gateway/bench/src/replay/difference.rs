@@ -90,7 +90,7 @@ impl Difference {
             DifferenceKind::Extra => "extra reply",
         };
         let joints = when.map_or_else(String::new, |RecordingPosition { joints, epoch, at_s }| {
-            format!(", joints {joints} (epoch {epoch}, {at_s:.3} s into the recording)")
+            format!(", joints message {joints} (epoch {epoch}, {at_s:.3} s into the recording)")
         });
         let epoch = Epoch(when.map_or(0, |when| when.epoch));
         let shown = |said: Option<&SentValue>| {
@@ -224,7 +224,7 @@ mod tests {
             Some(&now),
         );
         let expected =
-            "the first difference: cell 12 on vcan0, joints 37 (epoch 7, 2.384 s into the recording)
+            "the first difference: cell 12 on vcan0, joints message 37 (epoch 7, 2.384 s into the recording)
   recorded  torque 12 epoch 7: -0.2625 0.7800 0.0000 0.0000 0.0000 0.0000 Nm
   now       torque 12 epoch 7: -0.2622 0.7795 0.0000 0.0000 0.0000 0.0000 Nm
   joint 1: 1 step higher (0.0002 Nm), joint 2: 2 steps lower (0.0005 Nm)";

@@ -66,7 +66,8 @@ pub enum ReplayError {
     Run(RunError),
     /// The recording names a sine that this build does not have.
     #[error(
-        "the recording's cells computed with another sine: {error}; replay it with the build that recorded it"
+        "the cells in the recording used a different sine function: {error}; replay it with the build that \
+         recorded it"
     )]
     Sine {
         /// The unknown name.

@@ -236,8 +236,8 @@ fn survey_capture(
     if let Some((frame, nanos)) = backwards.filter(|(_, nanos)| *nanos > trace::order::REORDER_WINDOW_NS) {
         let back = Duration::from_nanos(nanos).as_secs_f64();
         note(format!(
-            "time stamps run backwards, first at frame {frame} by {back:.3} s: a frame that is older than one already \
-             sent is sent at once"
+            "time stamps go backwards (first at frame {frame}, by {back:.3} s): frames that are out of order are sent \
+             immediately"
         ));
     }
     if survey.frames == 0 {

@@ -102,16 +102,16 @@ impl UncomparedReplies {
     pub fn reason_counts(&self) -> Vec<(&'static str, u64)> {
         nonzero_counts([
             ("the cell was silent", self.silent),
-            ("the cell had not received the joints", self.untaken),
+            ("the cell had not received the joints message", self.untaken),
             ("the reply was not recorded", self.unrecorded),
             ("the recording ended", self.ended),
             ("the end of a contact was sent later", self.said_later),
-            ("no counters show whether the cell received the joints", self.uncounted),
-            ("the joints were not recorded", self.joints_unrecorded),
-            ("the joints came before the replayed part", self.joints_earlier),
+            ("no counters show whether the cell received the joints message", self.uncounted),
+            ("the joints message was not recorded", self.joints_unrecorded),
+            ("the joints message came before the replayed part", self.joints_earlier),
             ("the configure command came before the replayed part", self.requested_earlier),
             ("the cell used its own sensors", self.measured),
-            ("unrequested sensor pages were sent after other joints", self.sensed_otherwise),
+            ("unrequested sensor pages were sent after other joints messages", self.sensed_otherwise),
             ("the cell missed its slot", self.slot_skipped),
             ("a cell was changing its parent", self.parent_changing),
             ("a cell had not reported its parent", self.tree_unknown),
@@ -146,6 +146,11 @@ impl Summary {
             return Some(failure.clone());
         }
         let mut wrong: Vec<_> = cells_in_error(&self.cell_errors, quiet).into_iter().collect();
+        let compares_nothing =
+            |expect: &ReplyComparison| expect.tally.equal == 0 && expect.tally.has_only_equal_replies();
+        if self.expect.as_ref().is_some_and(compares_nothing) && !self.interrupted {
+            wrong.push("no reply was compared: replay a part in which cells answer".to_owned());
+        }
         if let Some(expect) = self.expect.as_ref().filter(|expect| !expect.tally.has_only_equal_replies()) {
             let ReplyTally { different, missing, extra, not_requested, .. } = expect.tally;
             let counts = nonzero_counts([
@@ -172,7 +177,8 @@ impl Summary {
             }
             if expect.joints_skipped > 0 && self.lockstep.is_none() {
                 wrong.push(format!(
-                    "cells skipped joints {} because they received them too late: use --lockstep to wait for the cells",
+                    "cells skipped joints messages {} because they received them too late: use --lockstep to wait for \
+                     the cells",
                     count_noun(expect.joints_skipped, "time", "times")
                 ));
             }
@@ -291,7 +297,7 @@ mod tests {
             ),
             (|_, expect| expect.recording_dropped = 2, "no difference: "),
             (|_, expect| expect.unchecked_cells = 1, "no difference: "),
-            (|_, expect| expect.tally.equal = 0, "problems: no reply was compared"),
+            (|_, expect| expect.tally.equal = 0, "problems: no reply was compared: "),
             (
                 |_, expect| expect.tally.different = 3,
                 "problems: replies differ from the recorded ones: 3 different",
