@@ -57,7 +57,7 @@ format = "{format}"
 kind = "kinesthetic"
 inertia = [1.0, 1.0, 1.0, 0.5, 0.5, 0.5]
 damping = [4.0, 4.0, 4.0, 2.0, 2.0, 2.0]
-max_speed_rad_s = [2.0, 2.0, 2.0, 3.0, 3.0, 3.0]
+max_speed = [2.0, 2.0, 2.0, 3.0, 3.0, 3.0]
 "#
     );
     for node in 1..=cells {

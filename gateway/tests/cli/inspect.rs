@@ -213,7 +213,7 @@ format = "fd"
 kind = "kinesthetic"
 inertia = [1.0, 1.0, 1.0, 0.5, 0.5, 0.5]
 damping = [4.0, 4.0, 4.0, 2.0, 2.0, 2.0]
-max_speed_rad_s = [2.0, 2.0, 2.0, 3.0, 3.0, 3.0]
+max_speed = [2.0, 2.0, 2.0, 3.0, 3.0, 3.0]
 
 [[cell]]
 bus = "vcan0"
@@ -251,14 +251,14 @@ fn the_worked_example_of_the_document_is_explained_in_a_terminal() {
     let folder = folder.path();
     let text = output(folder, "explain run.log --skin skin.toml --epoch 7 --cell 12");
     for line in [
-        "run.log: joints of epoch 7 on vcan0, 0.200000 s after the first frame",
+        "run.log: joints message of epoch 7 on vcan0, 0.200000 s after the first frame",
         "  contact    1.0000 + 1.0000 + 1.0000 N, proximity 0.0000",
-        "  since      the stimulus at 0.100000 s, in effect from the next joints on",
+        "  since      the stimulus at 0.100000 s, in effect from the next joints message on",
         "  F_c        3.0000 N, not below 0.1006 N: counts",
         "  F_p        0.0000, below 0.0500: none",
         "  F_z        1.0000 F_c + 0.0000 F_p = 3.000000 N, not below 0.1006 N",
         "  in words   196608 steps of 2^-16 N = 3.000000 N",
-        "  answered   0.500 ms after the joints",
+        "  answered   0.500 ms after the joints message",
         "  vcan0 12: it did not report its configuration hash, which is assumed to be that of the skin, 266D",
         "  vcan0: 1 cells sent nothing, and their contact state is not in the capture; they are assumed not to be in contact",
     ] {

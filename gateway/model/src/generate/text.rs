@@ -56,7 +56,7 @@ pub(super) fn skin_toml(target: &SkinRequest, arm: &CoveredArm) -> String {
     draft.set("kind", Value::Text("kinesthetic"));
     draft.set_with_comment("inertia", Value::Numbers(&[1.0, 1.0, 1.0, 0.5, 0.5, 0.5]), 11, "kg m2");
     draft.set_with_comment("damping", Value::Numbers(&[4.0, 4.0, 4.0, 2.0, 2.0, 2.0]), 11, "Nm s/rad");
-    draft.set("max_speed_rad_s", Value::Numbers(&[2.0, 2.0, 2.0, 3.0, 3.0, 3.0]));
+    draft.set("max_speed", Value::Numbers(&[2.0, 2.0, 2.0, 3.0, 3.0, 3.0]));
     for (bus, places) in arm.buses.iter().enumerate() {
         places.iter().zip(1..).for_each(|(place, node)| add_cell(&mut draft, bus, place, node));
     }
