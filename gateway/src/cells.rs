@@ -45,7 +45,7 @@ pub(crate) struct CellsCommand {
     /// Print one JSON object; with --watch, one per line
     #[arg(long, short)]
     json: bool,
-    /// Listen for this time [default: 1s; no limit with --watch]
+    /// Time for which to listen [default: 1s; no limit with --watch]
     #[arg(long, value_name = "TIME", value_parser = parse_duration, allow_negative_numbers = true)]
     duration: Option<f64>,
     #[command(flatten)]

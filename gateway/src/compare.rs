@@ -30,10 +30,10 @@ use super::print::{count_with_noun, to_pretty_json};
 
 /// Compare two recordings or logs of one skin, epoch by epoch
 ///
-/// Aligns joints and their replies by the number of their epoch. Epochs that one run has before the other starts, or
-/// after it ends, are reported but not compared. Reply times, late replies and lost packets are shown side by side and
-/// are no differences. docs/how-to/compare.md explains the rules. Exit code 0: equal; 1: different, or a file is
-/// damaged; 2: wrong use, or two skins.
+/// Aligns joints messages and their replies by the number of their epoch. Epochs that one run has before the other
+/// starts, or after it ends, are reported but not compared. Reply times, late replies and lost packets are shown side
+/// by side and are no differences. docs/how-to/compare.md explains the rules. Exit code 0: equal; 1: different, or a
+/// file is damaged; 2: wrong use, or two skins.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus compare yesterday.mcap today.mcap
@@ -71,7 +71,7 @@ pub(crate) struct CompareCommand {
     /// Accept differences between joint words of up to this many steps of 1/16384 quarter turn or m
     #[arg(long, value_name = "STEPS", default_value_t = 0)]
     joints_tolerance: u16,
-    /// Accept up to this many replies and joints that only one run has
+    /// Accept up to this many replies and joints messages that only one run has
     #[arg(long, value_name = "N", default_value_t = 0)]
     allow_missing: u64,
     /// Print one JSON object instead of the table

@@ -55,7 +55,8 @@ pub(crate) struct ConformanceCommand {
     /// Shell command that switches the cell off and on; needed for the requirements on the start of a cell
     #[arg(long, value_name = "COMMAND")]
     restart: Option<String>,
-    /// Test even if other cells are on the bus; they also receive the joints and halts of the test
+    /// Test even if other cells are on the bus; they also receive the joints and halt messages that
+    /// the test sends
     #[arg(long)]
     others_will_stop: bool,
     /// Save the cell's configuration to this file [default: conformance-BUS-NODE.json]

@@ -69,11 +69,11 @@ pub(crate) struct ConvertCommand {
     /// Number of decimals of a second in a log [default: as many as IN has]
     #[arg(long, value_parser = one_of_values(DIGITS), value_name = "N")]
     digits: Option<TimeDigits>,
-    /// Write the direction, T or R, after each frame of a log, which Wireshark cannot read. Without this option, only
-    /// a log that has directions keeps them
+    /// Append the direction, T or R, to each frame of a log; Wireshark cannot read such logs. Without this option,
+    /// directions are written only if IN is a log that has them
     #[arg(long, conflicts_with = "plain")]
     direction: bool,
-    /// Write only what every tool reads: frames with 6 digits, without direction, raw DLC and comments
+    /// Write only what every tool can read: time stamps with 6 decimals, and no directions, raw DLCs or comments
     #[arg(long)]
     plain: bool,
     /// For a CSV file: the skin [default: the skin in the recording]

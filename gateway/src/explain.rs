@@ -49,7 +49,7 @@ pub(crate) struct ExplainCommand {
     /// Epoch of the joint broadcast: its number modulo 256
     #[arg(long, value_name = "E", required_unless_present_any = ["force", "batch"])]
     epoch: Option<u8>,
-    /// Explain joints from this second of the run on; without a run, seconds count from the first frame
+    /// Explain a joint broadcast from this time on: seconds since the start of the run, or of a log since its first frame
     #[arg(long, value_name = "S", value_parser = parse_time_ns, default_value = "0", conflicts_with_all = ["force", "batch"])]
     at: u64,
     /// Explain the Kth joint broadcast of this epoch, if there are several

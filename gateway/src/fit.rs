@@ -19,9 +19,10 @@ use super::print::comma_separated;
 
 /// Compute whether a skin, or the traffic of a capture or a live bus, fits on real buses
 ///
-/// For a skin, computes the worst case: load, time from joints to the last answer, cells and buses, with the longest
-/// frames that bit stuffing allows, all cells answering, and no errors. Heartbeats count; commands and bench-only
-/// frames do not. Default bit rates: those of the skin if it has them for all buses, else a table of common ones.
+/// For a skin, computes the worst case: load, time from a joints message to the last answer, cells and buses, with the
+/// longest frames that bit stuffing allows, all cells answering, and no errors. Heartbeats count; commands and
+/// bench-only frames do not. Default bit rates: those of the skin if it has them for all buses, else a table of common
+/// ones.
 ///
 /// For a capture (a candump log or an MCAP recording, of any CAN bus), or for live buses until Ctrl-C, computes when
 /// each frame would be sent on a bus with bit rates: exact stuff bits, arbitration by identifier, no frame interrupted.

@@ -21,7 +21,7 @@ pub(crate) fn former_command_hint(words: &[String], name: &str) -> Option<String
 }
 
 /// Text for former options whose value can no longer be chosen.
-const FIXED_VALUE_HINT: &str = "no option instead: the value is fixed now";
+const FIXED_VALUE_HINT: &str = "its value is fixed now";
 
 /// Returns the line that gives the present name of a former option. `words` are the words of the command line.
 pub(crate) fn former_option_hint(words: &[String], option: &str) -> Option<String> {
@@ -45,7 +45,7 @@ pub(crate) fn former_option_hint(words: &[String], option: &str) -> Option<Strin
         ("replay", "--max") => "--speed max",
         ("replay", "--json") => "--summary -",
         ("skin", "--robot") if words.get(1).is_some_and(|word| word == "generate") => {
-            "no option instead: the robot is always a UR5"
+            "its value is fixed now: the robot is a UR5"
         }
         ("replay", "--view" | "--address-file" | "--token-file") => "`skinbus view SKIN` in another shell",
         ("replay", "--kind" | "--node") => {
@@ -61,7 +61,8 @@ pub(crate) fn former_option_hint(words: &[String], option: &str) -> Option<Strin
         ("skin", "--cells") if words.get(1).is_some_and(|word| word == "import") => "--places",
         _ => return None,
     };
-    Some(format!("there is no option {name} in {command}; use {now}"))
+    let verb = if now.starts_with(FIXED_VALUE_HINT) { "" } else { "use " };
+    Some(format!("there is no option {name} in {command}; {verb}{now}"))
 }
 
 #[cfg(test)]

@@ -37,7 +37,7 @@ const ANSWER_TIMEOUT: Duration = Duration::from_secs(1);
 /// instead, also on an embedded bus, which cansend cannot use. Then waits for the answers to a configure and prints
 /// them. Exit code 1: no addressed cell of a stimulus or configure is on the bus, or a cell refused.
 #[derive(Args, Debug)]
-#[command(mut_args(|arg| arg.global(true)), after_help = "Examples, of which the first three press cell 12 with 3 N from the next joints on:
+#[command(mut_args(|arg| arg.global(true)), after_help = "Examples, of which the first three press cell 12 with 3 N from the next joints message on:
   cansend vcan0 $(skinbus frame configure --cell 12 --write mode 1)
   cansend vcan0 $(skinbus frame stimulus --cell 12 --force 3.0)
   skinbus frame stimulus --cell 12 --force 3.0 --bus vcan0

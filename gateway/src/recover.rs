@@ -72,7 +72,9 @@ impl RecoverCommand {
             Some(bytes) => format!("{out}, {bytes} bytes: {recovered}"),
         };
         if recovered.lost_more_than_kept() {
-            return Err(Failure::run_error(format!("more of {name} is lost than was recovered: {line}")));
+            return Err(Failure::run_error(format!(
+                "only a part of {name} could be recovered, and most of it is lost: {line}"
+            )));
         }
         print_beside_files([Some(output.as_path())], &format!("{}\n", printable(&line)))
     }

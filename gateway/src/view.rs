@@ -62,7 +62,7 @@ pub(crate) struct ViewCommand {
     /// The skin of named buses or of a recording [default: the skin in the recording]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// Show this second of the recorded run (of a log: since the first frame) instead of playing it
+    /// Show one moment instead of playing: seconds since the start of the run, or of a log since its first frame
     #[arg(long, value_name = "S", value_parser = parse_time_ns)]
     at: Option<u64>,
     /// Address of the page; port 0 is any free port

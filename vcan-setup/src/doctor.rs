@@ -178,7 +178,7 @@ impl MachineFacts {
         let on = if on == name { name.clone() } else { format!("{on} {name}") };
         let (all, count) = (format_node_ids(&heard.cells), heard.cells.len());
         let gateway = heard.gateway.then(|| {
-            Finding::fault(format!("another gateway sends joints on {on}"))
+            Finding::fault(format!("another gateway sends joints messages on {on}"))
                 .with_hint("pgrep -a skinbus  # shows the gateway: stop it, or use another bus")
         });
         let absent = || {

@@ -201,13 +201,13 @@ pub fn plan_pair_up(target: &TargetPair<'_>, present: &[Interface]) -> Result<Pl
     let ip = there.name.ip_command();
     let (what, command) = match (other.up, other.mtu >= FD_MTU) {
         (true, true) => return Ok(plan),
-        (false, true) => ("down".to_owned(), format!("{ip} link set {peer} up")),
+        (false, true) => ("is down".to_owned(), format!("{ip} link set {peer} up")),
         (_, false) => (
-            format!("too small for CAN FD, with MTU {}", other.mtu),
+            format!("has MTU {}, which is too small for CAN FD", other.mtu),
             format!("sh -c '{}'", set_fd_mtu_command(&ip, peer)),
         ),
     };
-    let end = format!("{peer} in {}, is {what}", there.name);
+    let end = format!("{peer} in {}, {what}", there.name);
     Err(PlanRefusal::OtherEnd { name: name.to_owned(), end, command })
 }
 

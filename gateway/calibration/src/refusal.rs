@@ -86,7 +86,7 @@ pub enum Refusal {
     },
     /// The broadcast rate of joints differs from the skin's.
     #[error(
-        "{bus}: joints were broadcast {got} times a second, but the skin specifies {hz}: correct \
+        "{bus}: joints messages were broadcast {got} times a second, but the skin specifies {hz}: correct \
          joint_broadcast_hz in the skin"
     )]
     Rate {
@@ -126,7 +126,7 @@ pub enum Refusal {
     },
     /// Readings before and after a gap were not taken at the times of their joints.
     #[error(
-        "{bus}: from {at_s} s on, readings lag {ms} ms more behind their joints than elsewhere, so no pose \
+        "{bus}: from {at_s} s on, readings lag {ms} ms more behind their joints messages than elsewhere, so no pose \
          is reliable; {disturbance}; record again with a control loop that skips no ticks"
     )]
     Shifted {

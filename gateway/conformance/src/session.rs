@@ -232,7 +232,7 @@ impl<'a> Session<'a> {
             if let Some(id) = self.known.violated_requirement(&stray.message) {
                 let kind = stray.message.id().kind.name();
                 self.check(id, false, || {
-                    format!("the cell must not send a {kind} packet without a request, but it sent one")
+                    format!("the cell must not send an unrequested {kind} packet, but it sent one")
                 });
             }
         }

@@ -143,8 +143,8 @@ impl Survey {
         }
         if !others.is_empty() && !tolerated {
             return Err(format!(
-                "other cells are on {name}: {}; the test would send joints and halts to them too: disconnect \
-                 them, or use --others-will-stop",
+                "other cells are on {name}: {}; the test would send joints and halt messages to them too: \
+                 disconnect them, or use --others-will-stop",
                 others.join(", ")
             ));
         }

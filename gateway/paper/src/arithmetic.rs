@@ -90,11 +90,11 @@ pub fn sine_section() -> Section {
                 .draw_series("rounding alone", SeriesShape::Steps, rounded.parts.clone()),
         ])
         .with_findings([
-            mean("sine of fifth order, mean error", &fifth, 1.9e-4),
-            max("sine of fifth order, maximum error", &fifth, 4.6e-4),
-            mean("sine by eighths of a turn, mean error", &eighths, 2e-5),
-            max("sine by eighths of a turn, maximum error", &eighths, 1e-4),
-            Finding::new_unrated("rounding to Q1.14 alone, mean error", rounded.mean),
+            mean("mean error of the sine of fifth order", &fifth, 1.9e-4),
+            max("maximum error of the sine of fifth order", &fifth, 4.6e-4),
+            mean("mean error of the sine by eighths of a turn", &eighths, 2e-5),
+            max("maximum error of the sine by eighths of a turn", &eighths, 1e-4),
+            Finding::new_unrated("mean error of rounding to Q1.14 alone", rounded.mean),
         ])
 }
 

@@ -191,7 +191,7 @@ pub(super) fn slope_findings(what: &str, over: &TickTimes) -> [Finding; 3] {
         Finding::new_unrated(format!("distributed tick for each {what}"), distributed.slope_in("ns"))
             .with_paper_value(0.0),
         Finding::new_unrated(
-            format!("distributed slope over {what}s, upper 95 % limit, relative to the central slope"),
+            format!("slope of the distributed tick over {what}s, relative to that of the central one: upper 95 % limit"),
             (over.slope_ratio_at_most() * 100.0, "%"),
         )
         .with_requirement(

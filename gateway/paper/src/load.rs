@@ -42,8 +42,8 @@ pub fn load_section() -> Section {
     ];
     Section::new("load", "Bus load by number of cells")
         .with_paragraph(
-            "The load is the share of time that joints, replies and heartbeats occupy a bus when every cell is in \
-             contact: with 62.5 epochs and 4 heartbeats of each cell a second, 16 bytes in a packet, 11-bit \
+            "The load is the share of time that joints messages, replies and heartbeats occupy a bus when every cell \
+             is in contact: with 62.5 epochs and 4 heartbeats of each cell a second, 16 bytes in a packet, 11-bit \
              identifiers, and as many stuff bits as a frame can have. A load above 100 % is not possible. Sums along \
              the tree need as many frames on one shared bus. These are the numbers of `skinbus fit`, which shows \
              more about one skin.",
@@ -78,12 +78,12 @@ fn load_table(rows: &[RatesRow], cells: usize) -> Table {
         "joints and replies, %",
         "with heartbeats, %",
         "cells per bus",
-        "buses for time alone",
+        "buses needed, by bus time alone",
         "buses needed",
     ];
     let title = format!(
-        "Worst case: load of one bus with {cells} cells, maximum cells per bus in time, and buses needed for {cells} \
-         cells"
+        "Worst case: load of one bus with {cells} cells, maximum number of cells per bus that answer in time, and \
+         number of buses for {cells} cells"
     );
     Table::new(title, head, rows.iter().map(row))
 }

@@ -53,7 +53,10 @@ impl BenchRun {
     }
 
     fn switch_off_marks(&self) -> Vec<MarkLine> {
-        self.switch_off_time_s().map(|at| MarkLine::at_x(at, "central computation off")).into_iter().collect()
+        self.switch_off_time_s()
+            .map(|at| MarkLine::at_x(at, "without central computation"))
+            .into_iter()
+            .collect()
     }
 
     fn replies_finding(&self) -> Finding {
@@ -101,7 +104,7 @@ pub fn fig6_section(single: &BenchRun, summed: &BenchRun) -> Section {
         (mean_summed, "Nm"),
     );
     let rows = [
-        row("single cells, Q3.12, loaded joints", single, "single"),
+        row("single cells, Q3.12, at the joints that they load", single, "single"),
         row("single cells, compared with unrounded parameters", single, "unquantised"),
         row("whole skin, sum of Q3.12 words", single, "whole"),
         row("whole skin, sums along the tree in Q7.8", summed, "sums"),
@@ -114,10 +117,10 @@ pub fn fig6_section(single: &BenchRun, summed: &BenchRun) -> Section {
             single.switch_off_time_s().unwrap_or(f64::NAN)
         ))
         .with_paragraph(
-            "The errors compare each reply with the central computation for the same joint positions and touches, on \
-             the joints that the cell loads, so they contain no effect of delays; the curves show the torques that \
-             the loop had at each tick. The run with sums is a second run with the same touches; only epochs whose \
-             sums were complete in time are compared.",
+            "An error is the difference between a reply and the central computation for the same joint positions and \
+             touches, at the joints that the cell loads. Delays therefore have no effect on the errors. The curves \
+             show the torques that the loop had at each tick. The run with sums is a second run with the same \
+             touches. It is compared only in epochs whose sums were complete in time.",
         )
         .with_paragraph(joints_without_torque(single))
         .with_figures((0..single.joints).map(joint))
@@ -220,21 +223,21 @@ pub fn fig8_section(run: &BenchRun) -> Section {
         us(none_active),
     );
     let after_switch = Finding::less_is_better(
-        "T_total after the switch, median",
+        "median of T_total after the switchover",
         paper::NON_CENTRAL_WORK_S * 1e6,
         us(total[1]),
     );
     let of_active = slope.map(|line| {
         let slope = Quantity::new(line.slope * 1e3, "ns").with_half_interval(line.slope_half * 1e3);
-        Finding::new_unrated("T_total after the switch for each active cell", slope)
+        Finding::new_unrated("T_total after the switchover for each active cell", slope)
     });
     let took = |row: &TickRow| row.took_us;
     let central = |row: &TickRow| row.central_us;
     Section::new("fig8", format!("Fig. 8: cycle times, {cells} cells"))
         .with_paragraph(
             "T_total is the time of a tick from reading the sums to passing on its record, and T_skin is the time of \
-             the central computation in it. Unlike in the paper, T_total does not include the driver of the robot, \
-             because the robot is simulated.",
+             the central computation in it. At the switchover, the central computation is switched off. Unlike in the \
+             paper, T_total does not include the driver of the robot, because the robot is simulated.",
         )
         .with_paragraph(format!(
             "The axis ends at twice the 99th percentile. {beyond} of {} ticks, during which the machine was busy \
@@ -251,8 +254,10 @@ pub fn fig8_section(run: &BenchRun) -> Section {
         ])
         .with_findings([
             none,
-            Finding::new_unrated("T_skin after the switch, maximum", us(off)).with_paper_value(0.0).with_requirement("0", off <= 0.0),
-            Finding::new_unrated("T_total before the switch, median", us(total[0])),
+            Finding::new_unrated("maximum of T_skin after the switchover", us(off))
+                .with_paper_value(0.0)
+                .with_requirement("0", off <= 0.0),
+            Finding::new_unrated("median of T_total before the switchover", us(total[0])),
             after_switch.with_requirement("less than before", total[1] < total[0]),
         ])
         .with_findings(of_active)
@@ -315,8 +320,8 @@ mod tests {
         let section = fig8_section(&run);
         let of = |what: &str| section.findings.iter().find(|finding| finding.what.starts_with(what)).unwrap();
         assert!((of("mean T_skin").ours.value - 3.0).abs() < 1e-9);
-        assert!((of("T_total before").ours.value - 4.0).abs() < 1e-9);
-        assert!((of("T_total after the switch, median").ours.value - 1.0).abs() < 1e-9);
+        assert!((of("median of T_total before").ours.value - 4.0).abs() < 1e-9);
+        assert!((of("median of T_total after the switchover").ours.value - 1.0).abs() < 1e-9);
         assert!(section.findings.iter().all(|finding| finding.verdict != FindingVerdict::Worse));
         assert!((of("processor time of the gateway").ours.value - 10.0).abs() < 1e-9);
         let mut never_off = run;

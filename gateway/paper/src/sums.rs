@@ -146,11 +146,17 @@ type SumMethod = (&'static str, &'static str, fn(&SumErrors) -> f64);
 
 /// All kinds of sums that are compared.
 const SUM_METHODS: [SumMethod; 5] = [
-    ("truncated", "truncated, mean error", |at| at.truncated),
-    ("rounded", "rounded, mean error", |at| at.rounded),
-    ("carried", "carried, mean error of single epochs", |at| at.carried),
-    ("rounded, average of 32", "rounded, mean error of the average over 32 epochs", |at| at.rounded_average),
-    ("carried, average of 32", "carried, mean error of the average over 32 epochs", |at| at.carried_average),
+    ("truncated", "mean error per epoch, with truncation", |at| at.truncated),
+    ("rounded", "mean error per epoch, with rounding", |at| at.rounded),
+    ("carried", "mean error per epoch, with rounding errors carried over", |at| at.carried),
+    ("rounded, average of 32", "mean error of the average over 32 epochs, with rounding", |at| {
+        at.rounded_average
+    }),
+    (
+        "carried, average of 32",
+        "mean error of the average over 32 epochs, with rounding errors carried over",
+        |at| at.carried_average,
+    ),
 ];
 
 /// Writes the section on the error of sums over the number of active cells.
@@ -160,7 +166,7 @@ pub fn sums_section(skin: &Skin, errors: &[SumErrors]) -> Section {
     let figure = Figure::new(
         "sums",
         format!(
-            "Mean error of the summed torque by number of active cells, of {of} cells, Q7.8, loaded joints"
+            "Mean error of the summed torque (Q7.8) at the loaded joints, by number of active cells out of {of}"
         ),
         Axis::new("active cells", "").with_log_scale().with_ends(0.9, 300.0),
         Axis::new("mean absolute error", "Nm").with_log_scale().with_ends(1e-5, 1.0),
@@ -172,7 +178,7 @@ pub fn sums_section(skin: &Skin, errors: &[SumErrors]) -> Section {
     let at = errors.iter().filter(|errors| errors.active == FINDINGS_ACTIVE_CELLS).take(1);
     let findings = at.flat_map(|at| {
         SUM_METHODS.map(|(caption, what, error)| {
-            let what = format!("sum of {FINDINGS_ACTIVE_CELLS} active cells of {of}, {what}");
+            let what = format!("sum of {FINDINGS_ACTIVE_CELLS} active cells of {of}: {what}");
             let found = Finding::less_is_better(what, paper::SUMMED_ERROR_NM, (error(at), "Nm"));
             if caption == "rounded" { found.at_most(0.005) } else { found }
         })

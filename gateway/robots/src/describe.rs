@@ -137,9 +137,9 @@ pub enum ImportError {
     },
     /// A cell is too far from the joints that move it.
     #[error(
-        "{}position px,py,pz = {x},{y},{z} of link {link:?} can be up to {reach:.3} m from the frame of a \
-         preceding row, if all joints turn freely; it must be less than {MAX_REACH} m: correct the position, or \
-         choose a root nearer to the link",
+        "{}position px,py,pz = {x},{y},{z} of link {link:?} is too far from an earlier link of its chain: the distance \
+         can reach {reach:.3} m, but must be below {MAX_REACH} m: correct the position, or choose a root nearer to the \
+         link",
         line_prefix(*line)
     )]
     Reach {

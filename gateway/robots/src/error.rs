@@ -253,8 +253,8 @@ pub enum RobotProblem {
     },
     /// A cell on the chain can be farther from a joint than a cell can compute.
     #[error(
-        "link {link:?} can be up to {reach:.3} m from the frame of a preceding row, if all joints turn freely; it must \
-         be less than {MAX_REACH} m: choose a root and a tip that are nearer to each other"
+        "link {link:?} is too far from an earlier link of its chain: the distance can reach {reach:.3} m, but must be below \
+         {MAX_REACH} m: choose a root and a tip that are nearer to each other"
     )]
     Reach {
         /// Name of the link.

@@ -86,7 +86,7 @@ fn describe(skin: &Skin) -> String {
         let format = bus.format.name();
         let reply = match bus.reply {
             SkinReply::Torque => "torque".to_owned(),
-            SkinReply::Sum { slot_us, carry: true } => format!("sum, slots of {slot_us} us"),
+            SkinReply::Sum { slot_us, carry: true } => format!("sum in slots of {slot_us} us"),
             SkinReply::Sum { slot_us, carry: false } => format!("sum without carry, slots of {slot_us} us"),
         };
         let mut by_joint = BTreeMap::<_, usize>::new();

@@ -142,7 +142,7 @@ impl ComparisonText<'_> {
             ("lost packets", |it| it.lost),
             ("restarts of cells", |it| it.restarts),
             ("frames lost by recorder", |it| it.dropped),
-            ("joints out of order", |it| it.out_of_order),
+            ("joints messages out of order", |it| it.out_of_order),
             ("restarts of the numbering", |it| it.countings.saturating_sub(1).into()),
         ] {
             if of(a) + of(b) > 0 {
@@ -213,7 +213,7 @@ impl ComparisonText<'_> {
                     "torque" | "sum" => "a reply".to_owned(),
                     "contact" => "touched".to_owned(),
                     "halt" => "halted".to_owned(),
-                    _ => "joints".to_owned(),
+                    _ => "a joints message".to_owned(),
                 },
             };
             let time = time_s.get(which).map_or_else(String::new, |time| format!("{time:.3} s  "));
@@ -258,7 +258,8 @@ impl ComparisonText<'_> {
                  --joints-tolerance and --tolerance",
             ),
             ("torque" | "sum" | "joints", None) if first.how.starts_with("missing") => Some(
-                "on a busy machine, a cell skips joints that it received too late: --allow-missing N accepts some",
+                "on a busy machine, a cell skips joints messages that it received too late: --allow-missing N accepts \
+                 some",
             ),
             _ => None,
         }

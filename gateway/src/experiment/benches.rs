@@ -46,7 +46,7 @@ impl BenchRunner {
     /// Runs `skinbus run` on the arm and reads the recording.
     pub(super) fn run_arm_bench(&self, reply: ReplyMode, effort: Effort) -> Result<BenchRun, Failure> {
         let name = arm::run_file_name(reply);
-        let what = format!("the bench of the moving arm ({name})");
+        let what = format!("moving-arm bench ({name})");
         let file = |end: &str| self.folder.join(format!("arm-{name}{end}"));
         let recording = file(".mcap");
         let files = RunFiles {
@@ -75,7 +75,7 @@ impl BenchRunner {
     /// summary of a run that failed or was halted because the machine is too slow for it, but returns an error if cells
     /// failed.
     pub(super) fn run_scaled(&self, bench: &ScaleBench) -> Result<Value, Failure> {
-        let what = format!("the bench of {} cells ({})", bench.cells, bench.name());
+        let what = format!("bench of {} cells ({})", bench.cells, bench.name());
         let buses = buses::private_directory("experiment")?;
         // Files that can be generated again go into a temporary directory.
         let files = RunFiles {

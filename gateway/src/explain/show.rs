@@ -37,7 +37,7 @@ pub(super) fn format_explanation(
         let at = seconds_since(zero, bus.at_ns);
         let at = if is_of_run { format!("at {at:.6} s") } else { format!("{at:.6} s after the first frame") };
         let halted = if bus.halted { ", halted" } else { "" };
-        text += &format!("{name}: joints of epoch {epoch} on {}, {at}{halted}\n", bus.bus);
+        text += &format!("{name}: joints message of epoch {epoch} on {}, {at}{halted}\n", bus.bus);
         text += &positions(bus);
     }
     let cells = &explanation.cells;
@@ -256,7 +256,7 @@ fn format_cell_steps(cell: &CellExplanation, zero: u64) -> String {
         None => text += "  contact    not known\n",
     }
     match cell.answered_after_ns {
-        Some(nanos) => text += &format!("  answered   {} after the joints\n", format_millis(nanos)),
+        Some(nanos) => text += &format!("  answered   {} after the joints message\n", format_millis(nanos)),
         None => text += "  answered   nothing\n",
     }
     text + &format_joint_rows(std::slice::from_ref(cell), false)
@@ -292,7 +292,7 @@ fn format_force_origin(origin: &ContactOrigin, zero: u64) -> String {
         ContactOrigin::Mode { at_ns } => format!("the write of its mode at {} s", at(at_ns)),
         ContactOrigin::Said { at_ns } => format!("its own report at {} s", at(at_ns)),
         ContactOrigin::Stimulus { at_ns, from_epoch: None, .. } => {
-            format!("the stimulus at {} s, in effect from the next joints on", at(at_ns))
+            format!("the stimulus at {} s, in effect from the next joints message on", at(at_ns))
         }
         ContactOrigin::Stimulus { at_ns, from_epoch: Some(epoch), late } => {
             let late = if late { ", late" } else { "" };

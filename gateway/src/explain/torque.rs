@@ -29,8 +29,8 @@ const COLUMNS: Columns = Columns { needed: &["cell", "force_n", "q"], optional: 
 /// Options for a force on a cell, or rows of them.
 #[derive(Args, Debug)]
 pub(super) struct TorqueOptions {
-    /// Compute the torques of a force against the cell's outward normal in N, 0 to 95.997: the range of three contact
-    /// words
+    /// Compute the torques of a force against the cell's outward normal, from 0 to 95.997 N, which is what its three
+    /// contact sensors can report
     #[arg(long, value_name = "N", requires_all = ["cell", "joints"], conflicts_with_all = ["epoch", "skin"], allow_negative_numbers = true)]
     force: Option<f64>,
     /// Positions of the chain's joints in rad or m, separated by spaces
@@ -146,8 +146,8 @@ impl<'a> Calculator<'a> {
         let joints: Vec<_> = skin.joints_on_bus(cell.bus).map(|(_, joint)| joint).collect();
         if !(0.0..=MAX_FORCE_N).contains(&force) {
             return Err(format!(
-                "force {force} N: the force against the outward normal must be 0 to {MAX_FORCE_N:.3} N, the range of \
-                 three contact words"
+                "force {force} N: the force against the outward normal must be 0 to {MAX_FORCE_N:.3} N, what a \
+                 cell's three contact sensors can report"
             ));
         }
         let given: Vec<&str> = positions.split([' ', ',']).filter(|text| !text.is_empty()).collect();

@@ -50,7 +50,7 @@ pub(super) fn table(skin: &Skin, rows: &[RatesRow]) -> String {
         ),
     };
     format!(
-        "{}: {bus}, joints every {} ms, each cell computes for {} µs\n{table}\n\
+        "{}: {bus}, a joints message every {} ms, each cell computes for {} µs\n{table}\n\
          load    worst case: all cells answer; joints, {}, heartbeats{}\n\
          last    longest time from the scheduled joints message to the end of the last answer\n\
          cells   number of cells that a bus can serve in time; transceivers can drive about {}\n\

@@ -21,7 +21,7 @@ pub(super) enum PacketCommand {
     /// Make cells leave the halted state
     #[command(after_help = "Example:\n  skinbus frame resume")]
     Resume,
-    /// Make cells answer with a heartbeat when all work for the last joints is done
+    /// Make cells answer with a heartbeat when all work for the last joints message is done
     #[command(after_help = "Example:\n  skinbus frame sync")]
     Sync,
     /// Make cells answer with the pages of counters and sensors
@@ -60,7 +60,7 @@ struct Angles {
 /// A stimulus: the contact state of a cell in test mode
 ///
 /// The cell must be in test mode: `skinbus frame configure --cell N --write mode 1`. A stimulus takes effect with the
-/// next joints and holds until another one replaces it. Without --force the force is 0.
+/// next joints message and holds until another one replaces it. Without --force the force is 0.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus frame stimulus --cell 12 --force 3.0
@@ -81,7 +81,7 @@ pub(super) struct StimulusCommand {
     temperature: Option<Vec<String>>,
     #[command(flatten)]
     others: OtherPageOptions,
-    /// Epoch of the joints with which the stimulus takes effect [default: the next joints]
+    /// Epoch of the joints message with which the stimulus takes effect [default: that of the next one]
     #[arg(long, value_name = "E")]
     epoch: Option<u8>,
 }
@@ -264,7 +264,9 @@ fn parse_force_words(text: &str) -> Result<[Q5_10; 3], String> {
     let sum: f64 = words.into_iter().map(Q::to_f64).sum();
     if (sum - force).abs() > 1.0 / 1_024.0 {
         let [min, max] = [Q5_10::MIN, Q5_10::MAX].map(|word| 3.0 * word.to_f64());
-        return Err(format!("--force {text}: use {min} to {max:.3} N, the range of three contact words"));
+        return Err(format!(
+            "--force {text}: use {min} to {max:.3} N, what a cell's three contact sensors can report"
+        ));
     }
     Ok(words)
 }
@@ -299,7 +301,7 @@ mod tests {
         );
         assert_eq!(
             says("stimulus --cell 12 --force 96"),
-            "--force 96: use -96 to 95.997 N, the range of three contact words"
+            "--force 96: use -96 to 95.997 N, what a cell's three contact sensors can report"
         );
         assert_eq!(says("stimulus --cell 12 --force nan"), "--force nan: it must be a number");
         assert_eq!(says("stimulus --cell 12 --proximity -0.1"), "--proximity -0.1: proximity is 0 to 1");

@@ -305,7 +305,7 @@ fn add_reply_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) 
         add_joint_age_row(rows, bus);
     } else if bus.last_reply_us.count > 0 {
         let name = if bus.sums.is_some() { "last sum, µs" } else { "last reply, µs" };
-        rows.add_row(name, format_quantiles(&bus.last_reply_us), "after the joints");
+        rows.add_row(name, format_quantiles(&bus.last_reply_us), "after the joints message");
     }
 }
 

@@ -23,7 +23,7 @@ pub(super) struct CoverArguments {
     /// Treat these links as absent: their visuals are not read, and cells may be placed where they are
     #[arg(long, value_name = "LINK,..", requires = "cover", value_delimiter = ',', value_parser = parse_link_name)]
     leave_out: Vec<String>,
-    /// A box without cells, in m in the frame of a covered link; may be given several times
+    /// A box to keep free of cells: its corners in m, in the frame of a covered link; may be given several times
     #[arg(long, value_name = "LINK:MINX,MINY,MINZ,MAXX,MAXY,MAXZ", requires = "cover", value_parser = keep_out)]
     keep_out: Vec<ExcludedBox>,
     /// Random seed: the same seed gives the same cells

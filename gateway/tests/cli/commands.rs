@@ -247,7 +247,7 @@ fn wrong_use_is_one_line_and_exit_code_2() {
         ),
         (
             "frame stimulus --cell 12 --force 100",
-            "--force 100: use -96 to 95.997 N, the range of three contact words",
+            "--force 100: use -96 to 95.997 N, what a cell's three contact sensors can report",
         ),
         (
             "frame stimulus",
@@ -319,8 +319,8 @@ fn a_generated_skin_is_a_whole_file_and_checked_in_a_few_lines() {
         "ur5-3: 3 cells, 2 buses",
         "robot: UR5, 6 joints",
         "timing: control loop 500 Hz, joints 62.5 Hz (every 16000 us), kinesthetic controller",
-        "bus vcan0 (fd, sum, slots of 6000 us): 2 cells: 2 on joint 2; root 1",
-        "bus vcan1 (fd, sum, slots of 12000 us): 1 cell: 1 on joint 3; root 1",
+        "bus vcan0 (fd, sum in slots of 6000 us): 2 cells: 2 on joint 2; root 1",
+        "bus vcan1 (fd, sum in slots of 12000 us): 1 cell: 1 on joint 3; root 1",
     ];
     assert_eq!((hash.len(), lines), (1, expected.to_vec()));
 

@@ -170,7 +170,7 @@ fn standard_input_is_read_for_one_thing() {
     {
         let Output { status, stderr, .. } = piped(&skin, command);
         let said = String::from_utf8(stderr).unwrap();
-        let expected = "it can be read only once and was already read: use a file for one of the two\n";
+        let expected = "it can be read only once, but two arguments name it: use a file for one of them\n";
         assert_eq!((status.code(), said.contains(expected)), (Some(2), true), "{command}: {said}");
     }
     let Output { status, stderr, .. } = piped(&skin, "fit -");

@@ -437,8 +437,9 @@ fn the_command_says_what_it_did_and_overwrites_nothing() {
     fs::write(path("gap.mcap"), &gap).unwrap();
     let said = says("recover gap.mcap", 1);
     assert!(
-        said.contains("gap.mcap is lost than was recovered: gap-recovered.mcap, ")
-            && said.contains(" 20 of 100 messages"),
+        said.contains(
+            "only a part of gap.mcap could be recovered, and most of it is lost: gap-recovered.mcap, "
+        ) && said.contains(" 20 of 100 messages"),
         "{said}"
     );
     let exists = "skinbus: -o there.mcap: it exists: name another file, or overwrite it with --overwrite";

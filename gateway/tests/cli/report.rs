@@ -197,7 +197,10 @@ fn a_log_without_stimuli_does_not_say_that_nothing_was_touched() {
         log.lines().filter(|line| !is_stimulus(line)).map(|line| format!("{line}\n")).collect();
     fs::write(folder.path().join("rest.log"), rest).unwrap();
     let (page, said) = page(&folder, "rest.log --skin classic.toml");
-    assert!(said.contains("does not contain: stimuli or sensors, and so no central torques; "), "{said}");
+    assert!(
+        said.contains("does not contain: stimuli or sensors, and therefore no central torques; "),
+        "{said}"
+    );
     for text in [
         "This capture does not contain the stimuli or sensors of the cells that sent torques, which show the forces \
          on them.",

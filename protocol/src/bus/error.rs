@@ -85,8 +85,8 @@ pub enum BusError {
     /// There is neither a kernel interface nor an embedded bus of this name. Only
     /// [`Choice::Auto`](super::KindChoice::Auto) returns this.
     #[error(
-        "there is no interface {name}, and no embedded bus of this name is served in {}: make the interface with \
-         `vcan-setup up {name}`, or serve the bus with `vcan-setup serve {name}`", directory.display()
+        "there is no interface {name}, and no running program serves an embedded bus of this name in {}: make the \
+         interface with `vcan-setup up {name}`, or serve the bus with `vcan-setup serve {name}`", directory.display()
     )]
     Absent {
         /// The bus.

@@ -26,8 +26,9 @@ fn a_bus_that_nobody_serves_says_how_to_serve_it() {
 fn a_bus_of_either_kind_that_is_absent_names_both_ways() {
     let options = BusOptions { directory: Some("/nowhere/skinbus".into()), ..BusOptions::default() };
     let error = Bus::open("nosuchcan0", KindChoice::Auto, &options).unwrap_err();
-    let expected = "there is no interface nosuchcan0, and no embedded bus of this name is served in /nowhere/skinbus: make \
-                    the interface with `vcan-setup up nosuchcan0`, or serve the bus with `vcan-setup serve nosuchcan0`";
+    let expected = "there is no interface nosuchcan0, and no running program serves an embedded bus of this name in \
+                    /nowhere/skinbus: make the interface with `vcan-setup up nosuchcan0`, or serve the bus with \
+                    `vcan-setup serve nosuchcan0`";
     assert_eq!(error.to_string(), expected);
     assert!(error.may_open_later());
     // An interface of that name is chosen, whatever its type.

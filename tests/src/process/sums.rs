@@ -221,10 +221,10 @@ pub fn goes_on_without_a_wire(place: &TestDir, format: Format) {
     let test_client = TestClient::on(place, "vcan0", format);
     bench.wait_for_stderr("scenario: link down from cell 6 to cell 5 on vcan0");
     holds(&test_client, 12);
-    bench.wait_for_stderr("cell 4 on vcan0 has had no route to a root for");
+    bench.wait_for_stderr("cell 4 on vcan0 has had no route to the gateway for");
     holds(&test_client, 11);
     bench.wait_for_stderr("scenario: link up between cell 8 and cell 4 on vcan0");
-    bench.wait_for_stderr("cell 4 on vcan0 has a route to a root again, after");
+    bench.wait_for_stderr("cell 4 on vcan0 has a route to the gateway again, after");
     holds(&test_client, 12);
     end(place, bench);
     let summary = place.summary();

@@ -70,7 +70,7 @@ impl Host {
         let name = self.name;
         let link = self
             .start(&link_program(), &format!("link vcan0 --bus-kind embedded --host {name} --json {how}"));
-        link.wait_for_stderr(&format!("is linked as '{name}'"));
+        link.wait_for_stderr(&format!("is linked under the name '{name}'"));
         link
     }
 
@@ -172,7 +172,8 @@ fn cells_of_another_host_answer_as_if_they_were_here() {
     let (ended, bus) = pair.bench(|pair, _| {
         // `vcan-setup status` shows it too.
         let status = pair.robot.place.start("vcan-setup", "status vcan0").end().succeeded();
-        assert!(status.stdout.contains("vcan0 is linked as 'robot' with 'cells' (12 cells)"), "{status:#?}");
+        let linked = "vcan0 is linked under the name 'robot' with 'cells' (12 cells)";
+        assert!(status.stdout.contains(linked), "{status:#?}");
     });
     let of = |pointer: &str| bus.pointer(pointer).unwrap().as_u64().unwrap();
     assert_eq!((of("/hosts/0/gone"), of("/uplink/hosts")), (0, 0), "{bus:#}");

@@ -80,7 +80,7 @@ fn bit_rates_are_checked_and_set_only_on_request() {
     assert_eq!(can0(), before, "none of them did anything");
 
     let said = bench.run("up skin.toml --set-bit-rates");
-    assert_eq!(said, (0, "can0 is at 1000 kbit/s, and up\n".to_owned(), String::new()));
+    assert_eq!(said, (0, "can0 is up at 1000 kbit/s\n".to_owned(), String::new()));
     assert_eq!(can0(), (true, 1_000_000.into()));
     let unchanged =
         "can0 is CAN hardware (kvaser_pci), runs at 1000 kbit/s, as the skin requires, and stays unchanged\n";

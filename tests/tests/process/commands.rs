@@ -300,7 +300,7 @@ fn the_doctor_hears_gateways_and_cells() {
     let said = doctor_hears(&folder, "", &[stimulus]);
     assert_eq!(findings(&said, "fault"), Vec::<String>::new(), "somebody at a shell is no gateway");
     let said = doctor_hears(&folder, "", &[joints]);
-    let other_gateway = "another gateway sends joints on the embedded bus nosuchcan1";
+    let other_gateway = "another gateway sends joints messages on the embedded bus nosuchcan1";
     assert_eq!(findings(&said, "fault"), [other_gateway]);
     let cells = [heartbeat(3), heartbeat(12)];
     let said = doctor_hears(&folder, "", &cells);

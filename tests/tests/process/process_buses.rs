@@ -219,7 +219,7 @@ fn a_bus_that_is_lost_at_the_end_makes_the_run_fail_with_its_figures() {
     let ended = bench.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     assert!(
-        ended.stderr.ends_with("skinbus: these buses were lost at the end of the run: vcan1\n"),
+        ended.stderr.ends_with("skinbus: these buses were still lost when the run ended: vcan1\n"),
         "{ended:#?}"
     );
     let summary = place.summary();

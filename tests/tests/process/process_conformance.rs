@@ -236,8 +236,8 @@ fn what_cannot_be_tested_is_refused_in_a_line() {
     });
     assert_eq!(
         of(5).refusal(1),
-        "skinbus: other cells are on vcan0: 3; the test would send joints and halts to them too: disconnect them, or \
-         use --others-will-stop"
+        "skinbus: other cells are on vcan0: 3; the test would send joints and halt messages to them too: disconnect \
+         them, or use --others-will-stop"
     );
     // A busy machine may keep the cell waiting for longer than its time to answer.
     until("a test beside a cell that is tolerated", || {

@@ -34,7 +34,10 @@ fn the_moving_arm_is_run_recorded_drawn_and_rated() {
     assert!((1e-4..0.0356).contains(&summed), "{summed}");
     assert!((value(finding(1, "active at once")) - 24.0).abs() < 0.5);
     assert!(value(finding(1, "velocity")) > 0.0);
-    assert!(value(finding(2, "after the switch, maximum")) <= 0.0, "the central computation is off");
+    assert!(
+        value(finding(2, "maximum of T_skin after the switchover")) <= 0.0,
+        "the central computation is off"
+    );
     let page = place.read("results/report.html");
     assert!(page.contains("<svg") && page.contains("35.6\u{a0}mNm"));
     let torque = place.read("results/fig6-joint2.csv");
@@ -102,7 +105,7 @@ fn a_failed_or_interrupted_experiment_leaves_nothing() {
         (
             "experiment fig7 --quick -o results SKINBUS_CELL_NODE=nowhere/cell-node",
             1,
-            "the bench of the moving arm (single)",
+            "moving-arm bench (single)",
         ),
     ] {
         let ended = place.start("skinbus", words).end();

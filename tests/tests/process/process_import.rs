@@ -255,7 +255,7 @@ fn what_is_no_chain_of_joints_is_said_in_a_line() {
         // A defect that only the skin's check finds, reported with its line in the file.
         (
             format!("# mine\n{head}\nfore,0,0,0,0,0,1\n\nfore,3,0,0,0,0,1\n"),
-            "skinbus: cells.csv: line 5: position px,py,pz = 3,0,0 of link \"fore\" can be up to 3.",
+            "skinbus: cells.csv: line 5: position px,py,pz = 3,0,0 of link \"fore\" is too far from an earlier link of its chain: the distance can reach 3.",
         ),
         (
             format!("{head},bus,node\nfore,0,0,0,0,0,1,,300\n"),
@@ -407,7 +407,7 @@ fn torques_of_a_force_are_computed_in_both_ways() {
         (
             "cell,force_n,q\n1,1,0 0.5\nvcan0:2,96,0 0.5\n",
             "skinbus: rows.csv, row 2: cell vcan0:2: force 96 N: the force against the outward normal must be 0 to \
-             95.997 N, the range of three contact words",
+             95.997 N, what a cell's three contact sensors can report",
         ),
         (
             "cell,force_n,q\n2,1,0 -6.3\n",

@@ -251,7 +251,7 @@ fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
         "{ended:#?}"
     );
     let text = replayed.text("/expect/first/text");
-    assert!(ended.stdout.contains(text) && text.contains("cell 2 on vcan0, joints "), "{text}");
+    assert!(ended.stdout.contains(text) && text.contains("cell 2 on vcan0, joints message "), "{text}");
     let lines: Vec<_> = text.lines().map(str::trim).collect();
     assert!(lines[1].starts_with("recorded  torque 2 epoch ") && lines[1].ends_with(" Nm"), "{text}");
     assert!(lines[2].starts_with("now       torque 2 epoch "), "{text}");
@@ -345,7 +345,10 @@ fn sums_without_their_children_come_back_in_any_tree() {
     // A cell that changes its parent is left out, and so is a resent sum with more cells in it.
     assert!((1..=10).contains(&different), "{:#}", replayed.0);
     let text = replayed.text("/expect/first/text");
-    assert!(text.starts_with(&format!("the first difference: cell {root} on vcan0, joints ")), "{text}");
+    assert!(
+        text.starts_with(&format!("the first difference: cell {root} on vcan0, joints message ")),
+        "{text}"
+    );
     let lines: Vec<_> = text.lines().map(str::trim).collect();
     assert!(lines[1].starts_with(&format!("recorded  sum {root} epoch ")), "{text}");
     assert!(lines[1].contains("; minus its child"), "{text}");

@@ -232,11 +232,11 @@ fn a_link_that_a_page_takes_down_leaves_a_cell_unreachable() {
     page.command(&link(true, 4, 3));
     page.command(&link(true, 8, 4));
     run.wait_for_stderr("view: link down between cell 4 and cell 3 on vcan0");
-    run.wait_for_stderr("cell 4 on vcan0 has had no route to a root for ");
+    run.wait_for_stderr("cell 4 on vcan0 has had no route to the gateway for ");
     let down = json!([{ "bus": 0, "nodes": [3, 4] }, { "bus": 0, "nodes": [4, 8] }]);
     page.wait_for_status("both links", |said| said["bench"]["links_down"] == down);
     page.command(&link(false, 3, 4));
-    run.wait_for_stderr("cell 4 on vcan0 has a route to a root again, after");
+    run.wait_for_stderr("cell 4 on vcan0 has a route to the gateway again, after");
     page.wait_for_status("one link", |said| {
         said["bench"]["links_down"] == json!([{ "bus": 0, "nodes": [4, 8] }])
     });

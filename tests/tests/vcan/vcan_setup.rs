@@ -470,7 +470,7 @@ fn the_doctor_finds_what_is_wrong_and_its_hints_repair_it() {
     assert_eq!(while_sending(&open("vcan20"), &[heartbeat], || doctor("vcan20")), (0, vec![]));
     let other_gateway = while_sending(&open("vcan20"), &[heartbeat, joints], || doctor("vcan20"));
     assert!(
-        other_gateway.0 == 1 && other_gateway.1[0].starts_with("another gateway sends joints on vcan20"),
+        other_gateway.0 == 1 && other_gateway.1[0].starts_with("another gateway sends joints messages on"),
         "{other_gateway:?}"
     );
     assert!(doctor("vcan20").1[0].starts_with("no cell sends on vcan20"));

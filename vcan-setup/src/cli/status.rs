@@ -100,7 +100,7 @@ fn format_link_reports(links: &BTreeMap<&str, hosts::LinkReport>) -> String {
     let line = |(bus, report): (&&str, &hosts::LinkReport)| {
         let hosts: Vec<_> = report.hosts.iter().map(host).collect();
         let with = if hosts.is_empty() { "no host yet".to_owned() } else { hosts.join(", ") };
-        format!("{bus} is linked as '{}' with {with}\n", report.host)
+        format!("{bus} is linked under the name '{}' with {with}\n", report.host)
     };
     links.iter().map(line).collect()
 }

@@ -78,10 +78,10 @@ impl MachineFacts {
             ))
             .with_hint(up),
             (true, true) => Finding::ok(format!(
-                "there is no interface {name}, but an embedded bus of this name is served"
+                "there is no interface {name}, but a running program serves an embedded bus of this name"
             )),
             (true, false) => Finding::fault(format!(
-                "there is no interface {name}, and no embedded bus of this name is served"
+                "there is no interface {name}, and no running program serves an embedded bus of this name"
             ))
             .with_hint(up)
             .with_hint(format!("{} serve {name} &", self.program)),
@@ -221,7 +221,7 @@ impl MachineFacts {
                     Finding::ok(format!("{name} runs at {has}, as the skin requires"))
                 }
                 Some(_) => Finding::note(format!(
-                    "{name} runs at {has}; the skin does not specify a bit rate to compare"
+                    "{name} runs at {has}; the skin specifies no bit rate to compare it with"
                 ))
                 .with_hint("bitrate = ...  # under its [[bus]] in the skin"),
                 None => Finding::ok(format!("{name} runs at {has}")),

@@ -188,7 +188,8 @@ fn a_bus_of_either_kind_that_is_absent_is_made_by_a_run_that_starts_its_cells() 
     assert_eq!(
         absent(true, None),
         [format!(
-            "fault: {text}, and no embedded bus of this name is served | sudo vcan-setup up skin.toml | vcan-setup serve vcan0 &"
+            "fault: {text}, and no running program serves an embedded bus of this name | sudo vcan-setup up \
+             skin.toml | vcan-setup serve vcan0 &"
         )]
     );
     assert_eq!(absent(true, Some(ObservedTraffic::default())).len(), 1, "no cell sends there");
@@ -294,7 +295,8 @@ fn hardware_has_to_have_the_skins_bit_rates_and_to_take_part() {
     let unsaid = about_hardware(open, fine);
     assert_eq!(unsaid.len(), 1);
     assert!(
-        unsaid[0].starts_with("note: can0 runs at 1000 kbit/s, data 5000 kbit/s; the skin does not specify",)
+        unsaid[0]
+            .starts_with("note: can0 runs at 1000 kbit/s, data 5000 kbit/s; the skin specifies no bit rate",)
     );
     let narrow = about_hardware(open, |can0, _| can0.mtu = CLASSIC_MTU);
     assert!(
@@ -317,8 +319,10 @@ fn hardware_has_to_have_the_skins_bit_rates_and_to_take_part() {
 fn another_gateway_and_cells_that_are_there_end_a_run_before_it_begins() {
     assert_eq!(
         listens(ObservedTraffic { gateway: true, ..ObservedTraffic::default() }, false),
-        ["fault: another gateway sends joints on vcan0 | pgrep -a skinbus  # shows the gateway: stop it, \
-             or use another bus"]
+        [
+            "fault: another gateway sends joints messages on vcan0 | pgrep -a skinbus  # shows the gateway: stop it, \
+             or use another bus"
+        ]
     );
     let there = listens(cells(1..=14), false);
     assert!(there[0].starts_with(
@@ -340,7 +344,7 @@ fn another_gateway_and_cells_that_are_there_end_a_run_before_it_begins() {
     let other_gateway = Some(ObservedTraffic { gateway: true, ..ObservedTraffic::default() });
     assert!(
         embedded(other_gateway)[0]
-            .starts_with("fault: another gateway sends joints on the embedded bus vcan0")
+            .starts_with("fault: another gateway sends joints messages on the embedded bus vcan0")
     );
 }
 

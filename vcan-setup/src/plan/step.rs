@@ -87,7 +87,7 @@ impl Step {
             }
             StepAction::BringUp { .. } => format!("{name} is up"),
             StepAction::Widen { .. } => format!("{name} has MTU {FD_MTU}, and is up"),
-            StepAction::SetRates { rates, .. } => format!("{name} is at {rates}, and up"),
+            StepAction::SetRates { rates, .. } => format!("{name} is up at {rates}"),
             StepAction::Remove { .. } => format!("{name} is removed"),
         }
     }

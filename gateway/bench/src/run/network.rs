@@ -259,7 +259,7 @@ impl Network {
             let (has, their) =
                 if cells.len() == 1 { ("has", "its torque") } else { ("have", "their torques") };
             look.notes.push(format!(
-                "{} on {} {has} had no route to a root for {:.1} s, so no sum contains {their}",
+                "{} on {} {has} had no route to the gateway for {:.1} s, so no sum contains {their}",
                 check::cell_list(&cells),
                 self.name,
                 oldest.seconds()
@@ -269,7 +269,7 @@ impl Network {
             let cells: Vec<_> = back.into_iter().map(|(cell, _)| cell).collect();
             let has = if cells.len() == 1 { "has" } else { "have" };
             look.notes.push(format!(
-                "{} on {} {has} a route to a root again, after {:.1} s",
+                "{} on {} {has} a route to the gateway again, after {:.1} s",
                 check::cell_list(&cells),
                 self.name,
                 longest.seconds()
@@ -424,7 +424,9 @@ mod tests {
         assert_eq!(look(&mut network, &link_down), Vec::<String>::new());
         assert_eq!(
             look(&mut network, &link_down),
-            ["cells 2, 3 on vcan0 have had no route to a root for 0.4 s, so no sum contains their torques"]
+            [
+                "cells 2, 3 on vcan0 have had no route to the gateway for 0.4 s, so no sum contains their torques"
+            ]
         );
         assert_eq!(look(&mut network, &link_down), Vec::<String>::new());
         assert_eq!(network.unreachable_nodes().collect::<Vec<_>>(), [2, 3]);
@@ -432,10 +434,13 @@ mod tests {
         let partial = [Some((Some(0), 0)), None, Some((Some(1), 1))];
         assert_eq!(
             look(&mut network, &partial),
-            ["cell 3 on vcan0 has a route to a root again, after 0.8 s"]
+            ["cell 3 on vcan0 has a route to the gateway again, after 0.8 s"]
         );
         assert_eq!(network.unreachable_nodes().count(), 0);
-        assert_eq!(look(&mut network, &whole), ["cell 2 on vcan0 has a route to a root again, after 1.0 s"]);
+        assert_eq!(
+            look(&mut network, &whole),
+            ["cell 2 on vcan0 has a route to the gateway again, after 1.0 s"]
+        );
         assert_eq!(network.longest_unreachable, Span::from_millis(800));
     }
 }

@@ -207,7 +207,8 @@ fn add_unexplained_losses(look_at: &mut Vec<String>, bus: &BusSummary) {
     }
     if let Some(parts) = bus.sums.map(|sums| sums.contributions).filter(|parts| parts.missing > 0) {
         look_at.push(format!(
-            "{} of {} were missing on {name}: a cell had no route to a root, sums were lost, or the machine was busy",
+            "{} of {} were missing on {name}: a cell had no route to the gateway, sums were lost, or the machine was \
+             busy",
             parts.missing,
             count_noun(parts.due, "contribution to sums", "contributions to sums")
         ));
@@ -219,7 +220,7 @@ fn add_network_findings(look_at: &mut Vec<String>, bus: &BusSummary) {
     let Some(network) = &bus.network else { return };
     if !network.unreachable.is_empty() {
         look_at.push(format!(
-            "{}: no route to a root at the end, so no sum contains their torques; check their wires",
+            "{}: no route to the gateway at the end, so no sum contains their torques; check their wires",
             cell_names(&network.unreachable, &bus.name)
         ));
     } else if network.tree_ready_s.is_none() {
@@ -326,7 +327,7 @@ fn add_explained_losses(look_at: &mut Vec<String>, bus: &BusSummary) {
     let (name, replies, up) = (&bus.name, &bus.replies, &bus.uplink);
     let reasons = [
         (replies.lost, "lost on the way to the gateway"),
-        (replies.not_heard, "not sent, because the cell did not receive the joints"),
+        (replies.not_heard, "not sent, because the cell did not receive the joints message"),
         (replies.in_doubt, "uncertain, because the cell was silent or restarted, or the bus was lost"),
     ];
     let missing = nonzero_counts(reasons);
@@ -348,7 +349,7 @@ fn add_explained_losses(look_at: &mut Vec<String>, bus: &BusSummary) {
     }
     if bus.dropped_by_bus > up.dropped {
         look_at.push(format!(
-            "{} from any sender dropped by {name}, because this machine did not read them in time",
+            "{name} dropped {}, from cells or other senders, because this machine did not read them in time",
             count_noun(bus.dropped_by_bus - up.dropped, "frame", "frames")
         ));
     }
@@ -399,7 +400,7 @@ fn add_late_replies(look_at: &mut Vec<String>, bus: &BusSummary) {
     let RepliesSummary { due, late, too_late, skipped, .. } = bus.replies;
     let parts = nonzero_counts([
         (late + too_late, "late"),
-        (skipped, "skipped, because the cells received the joints too late"),
+        (skipped, "skipped, because joints messages reached the cells late"),
     ]);
     if !parts.is_empty() {
         look_at.push(format!(

@@ -67,7 +67,7 @@ fn check_held_state(session: &mut Session<'_>) -> Result<Option<HeartbeatGrid>, 
         session.packets.get(first..).unwrap_or_default().iter().filter_map(CellPacket::heartbeat_and_epoch);
     let is_halted = beats.clone().all(|(beat, _)| beat.state.has(State::HALTED));
     session.check("CMD-1", is_halted, || {
-        "HALTED must stay set until a resume, but the cell sent a heartbeat without it".to_owned()
+        "HALTED must stay set until a resume, but it was clear in a heartbeat".to_owned()
     });
     session.send_next_joints(&[0; MAX_JOINTS])?;
     session.send_messages(&[Message::Resume])?;

@@ -128,7 +128,7 @@ fn check_simultaneous_claims(session: &mut Session<'_>, own: u32) -> Result<(), 
         }
         session.check("CLAIM-6", count == 1, || {
             format!(
-                "the cell must answer three claims within {} us with one heartbeat, but it sent {count}",
+                "the cell must answer three claims that arrive within {} us with one heartbeat, but it sent {count}",
                 apart.0
             )
         });

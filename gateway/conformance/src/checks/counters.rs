@@ -105,10 +105,10 @@ fn effective_packets(session: &Session<'_>) -> Vec<(&'static str, Packet)> {
         ("a report", packet(Id::command(Command::Report), [0; 6], 0, 0)),
         ("a claim of the cell's node id", packet(Id::new(Kind::Network, own), claim, 0, 0)),
         ("a read request", packet(Id::new(Kind::Configure, own), [0; 6], 8, 0)),
-        ("a read request to everyone", packet(Id::new(Kind::Configure, Node::Everyone), [0; 6], 8, 0)),
+        ("a read request to all cells", packet(Id::new(Kind::Configure, Node::Everyone), [0; 6], 8, 0)),
         ("a stimulus", packet(Id::new(Kind::Stimulus, own), [999, 0, 0, 0, 0, 0], 0, 0x80)),
         (
-            "a stimulus to everyone",
+            "a stimulus to all cells",
             packet(Id::new(Kind::Stimulus, Node::Everyone), [999, 0, 0, 0, 0, 0], 0, 0x80),
         ),
     ]

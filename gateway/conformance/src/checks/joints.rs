@@ -35,8 +35,8 @@ fn check_epoch_jumps(session: &mut Session<'_>) -> Result<(), StopReason> {
         let came = session.send_joints_at_epoch(epoch, &POSITIONS)?.torque;
         session.check("JOINTS-1", came.is_some(), || {
             format!(
-                "the cell must answer joints of epoch {epoch}, {} epochs after the last joints, with a \
-                 torque message, but it sent none",
+                "the cell must answer the joints message of epoch {epoch}, {} epochs after the last one, with \
+                 a torque message, but it sent none",
                 step.cast_signed()
             )
         });
@@ -77,7 +77,7 @@ fn check_repeated_epochs(session: &mut Session<'_>) -> Result<(), StopReason> {
             let joints = session.joints_message(first, &positions);
             let exchange = session.exchange_messages(&[joints])?;
             session.check("JOINTS-1", exchange.is_silent(), || {
-                format!("the cell must not answer repeated joints of epoch {first}, but it did")
+                format!("the cell must not answer a repeated joints message of epoch {first}, but it did")
             });
         }
         // A pending stimulus must not be latched by repeated joints.
@@ -127,8 +127,8 @@ fn check_joint_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
         });
         session.check("JOINTS-2", exchange.is_silent(), || {
             format!(
-                "the cell must not answer a joints message with count {count}, because the chain has 6 \
-                 joints, but it did"
+                "because the chain has 6 joints, the cell must not answer a joints message with count {count}, \
+                 but it did"
             )
         });
         let after = session.counters()?;
@@ -145,8 +145,8 @@ fn check_joint_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
         let step = session.send_joints_at_epoch(epoch, &POSITIONS)?;
         session.check("JOINTS-2", step.torque.is_some(), || {
             format!(
-                "after joints with a wrong count, the cell must answer joints of epoch {epoch} with the \
-                 right count, but it did not"
+                "the cell must answer the valid joints message of epoch {epoch} that follows one with a wrong \
+                 count, but it did not"
             )
         });
         before = session.counters()?;
@@ -162,9 +162,9 @@ fn check_joint_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
         let id = if is_repeated { "JOINTS-1" } else { "COUNT-1" };
         session.check(id, (repeated, meaning) == (is_repeated.into(), (!is_repeated).into()), || {
             format!(
-                "the cell counted joints of the last epoch with count {count} {repeated} times as repeated \
-                 and {meaning} times in the counter 'meaning'; it must count those with count 5 once as \
-                 repeated, and those with count 0 once in 'meaning'"
+                "if a joints message repeats the last epoch, the cell must count it once as repeated if its \
+                 count is 5, and once in the counter 'meaning' if its count is 0, but it counted that with \
+                 count {count} {repeated} times as repeated and {meaning} times in 'meaning'"
             )
         });
         before = after;
@@ -291,8 +291,8 @@ fn send_joints_burst(
     session.check("JOINTS-4", is_so, || {
         format!(
             "the counters must match the {JOINTS_PER_BURST} joints messages sent and the torque messages \
-             received, but the cell counted {joints} joints, {skipped} skipped joints and {torques} torques, \
-             and sent {} torque messages",
+             received, but the cell counted {joints} joints messages, {skipped} skipped ones and {torques} \
+             torques, and sent {} torque messages",
             answers.len()
         )
     });
@@ -332,8 +332,8 @@ fn find_old_answer(sent: &[(u8, Micros)], answers: &[(Micros, u8)]) -> Option<St
     });
     let Some([(before, first), (_, epoch)]) = late else { return None };
     Some(format!(
-        "with a period of 1 us, the cell must skip joints of epoch {epoch} as too old, but it answered them; \
-         they arrived before the answer to epoch {first} at {} us",
+        "with a period of 1 us, the cell must skip the joints message of epoch {epoch} as too old, because it \
+         arrived before the answer to epoch {first} at {} us, but the cell answered it",
         before.0
     ))
 }

@@ -93,7 +93,7 @@ fn check_state_kept_by_commit(session: &mut Session<'_>) -> Result<(), StopReaso
     let joints = session.joints_message(session.known.last_epoch, &POSITIONS);
     let again = session.exchange_messages(&[joints])?;
     session.check("CONF-7", again.is_silent(), || {
-        "the cell must not answer joints that are repeated after a commit, but it did".to_owned()
+        "the cell must not answer a joints message that is repeated after a commit, but it did".to_owned()
     });
     check_stimuli_kept(session, later, "CONF-7", "a commit")?;
     // A halted cell stays halted.

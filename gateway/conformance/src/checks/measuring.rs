@@ -43,7 +43,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
         };
         session.check("JOINTS-6", wrong.is_none(), || {
             format!(
-                "outside test mode, answers to joints must agree with the bit ACTIVE: {}",
+                "outside test mode, answers to joints messages must agree with the bit ACTIVE: {}",
                 wrong.unwrap_or_default()
             )
         });

@@ -268,7 +268,8 @@ pub(super) fn check_unused_bits_ignored(session: &mut Session<'_>) -> Result<(),
             heard.iter().any(|it| it.heartbeat_and_epoch().is_some())
         })?;
         session.check("OPT-2", is_there, || {
-            "the cell must answer a sync in an FD frame without bit-rate switch, but it did not".to_owned()
+            "if a sync arrives in an FD frame that has no bit-rate switch, the cell must answer it, but it did not"
+                .to_owned()
         });
     }
     if session.about.test_mode && session.about.committed {
@@ -314,8 +315,8 @@ fn check_extra_words(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.check("OPT-2", got == Some(expected), || {
         let got = got.map_or_else(|| "nothing".to_owned(), |got| arm::format_words(&got));
         format!(
-            "the cell must ignore words after the joints of the chain, but they changed the torque from {} \
-             to {got}",
+            "the cell must ignore the words of a joints message beyond the joints of the chain, but they \
+             changed the torque from {} to {got}",
             arm::format_words(&expected)
         )
     });

@@ -37,7 +37,8 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.stage_parameters(&Parameters { joints: 3, joint: 3, ..other })?;
         let step = session.stimulate_and_send_joints(&[0x0222; MAX_JOINTS], arm::press_with_sum(4_096))?;
         session.check("JOINTS-2", step.torque.is_some(), || {
-            "while a shorter chain is staged, the cell must answer joints of the chain in use, but it did not"
+            "while a shorter chain is staged, the cell must answer joints messages of the chain in use, but it did \
+             not"
                 .to_owned()
         });
         session.stimulate_and_send_joints(&[0x0222; MAX_JOINTS], arm::press_with_sum(0))?;

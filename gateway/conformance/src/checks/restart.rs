@@ -162,8 +162,8 @@ fn settled(session: &mut Session<'_>, claimed: Micros) -> Result<Option<Micros>,
     let expected = claim(session);
     session.check("CLAIM-5", at.is_some(), || {
         format!(
-            "{} ms after its first heartbeat, the cell must send a heartbeat without CLAIMING, but it sent \
-             none",
+            "{} ms after its first heartbeat, the cell must send a heartbeat in which CLAIMING is clear, but \
+             it sent none",
             expected.0 / 1_000
         )
     });

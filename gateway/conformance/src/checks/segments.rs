@@ -76,8 +76,8 @@ fn check_three_segments(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.mark_packets_expected();
     let came = session.answers().iter().any(|it| it.torque().is_some());
     session.check("COUNT-3", !came, || {
-        "the cell must not answer joints of three segments 9 ms apart, because the first is too old when the \
-         last arrives, but it did"
+        "if the three segments of a joints message are 9 ms apart, the first is too old when the last arrives, \
+         and the cell must not answer, but it did"
             .to_owned()
     });
     session.send_next_joints(&[0x0111; MAX_JOINTS])?;
@@ -287,8 +287,8 @@ fn check_joints_segments(session: &mut Session<'_>) -> Result<(), StopReason> {
             let is_so = came == arrives && counted == u16::from(!arrives) && step.torque.is_some();
             session.check("COUNT-3", is_so, || {
                 format!(
-                    "a cell must wait 15 ms for the next segment of joints, but segments {} us apart were \
-                     {}answered, and {counted} packets were counted as incomplete",
+                    "a cell must wait 15 ms for the next segment of a joints message, but segments {} us apart \
+                     were {}answered, and {counted} packets were counted as incomplete",
                     apart.0,
                     if came { "" } else { "not " }
                 )

@@ -379,9 +379,9 @@ fn check_page_times(session: &mut Session<'_>, period: u64, with_joints: bool) -
             session.check(id, is_so, || {
                 let times = format_ms(times.iter().copied());
                 format!(
-                    "with a period of {period} ms{}, the cell sent sensors page 0 {times} ms after the \
-                     switch, but it must send it after {} ms and then every {period} ms",
-                    if with_joints { " and joints every 16 ms" } else { "" },
+                    "with a period of {period} ms{}, the cell must send sensors page 0 {} ms after the switch \
+                     and then every {period} ms, but it sent it {times} ms after the switch",
+                    if with_joints { " and a joints message every 16 ms" } else { "" },
                     first / 1_000
                 )
             });

@@ -72,7 +72,7 @@ fn check_press_latched(
     let is_there = step.torque.is_some_and(|words| !words.is_zero());
     session.check(id, is_there == (sum > 0), || {
         format!(
-            "joints of epoch {epoch} must latch a force of {} N, but the torque words are {}",
+            "the joints message of epoch {epoch} must latch a force of {} N, but the torque words are {}",
             f64::from(sum) / 1024.0,
             arm::format_words(&step.words())
         )

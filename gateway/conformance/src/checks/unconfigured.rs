@@ -24,9 +24,9 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
         let latched = session.read_latched_skin()?;
         session.check("JOINTS-3", latched == Some(skin), || {
             format!(
-                "a cell without a configuration latched {}, but it must latch {}",
-                arm::format_skin(latched),
-                arm::format_skin(Some(skin))
+                "a cell without a configuration must latch {}, but it latched {}",
+                arm::format_skin(Some(skin)),
+                arm::format_skin(latched)
             )
         });
         session.switch_test_mode(true)?;
@@ -44,7 +44,8 @@ fn check_staged_reads(session: &mut Session<'_>) -> Result<(), StopReason> {
     let reply = session.read_parameter(number)?;
     session.check("CONF-1", reply == Reply::Value(pose), || {
         format!(
-            "without a configuration, parameter {number} must read as the staged {}, but it reads as {reply}",
+            "before the cell is configured, a read of parameter {number} must return the written value {}, but \
+             the answer was {reply}",
             Reply::Value(pose)
         )
     });
@@ -52,7 +53,7 @@ fn check_staged_reads(session: &mut Session<'_>) -> Result<(), StopReason> {
     let reply = session.write_first_words(Parameter::Commit.number(), [0])?;
     let is_refused = matches!(reply, Reply::Refused(_));
     session.check("CONF-7", is_refused, || {
-        format!("a commit with hash 0 must be refused without a configuration, but the answer was {reply}")
+        format!("a cell without a configuration must refuse a commit with hash 0, but the answer was {reply}")
     });
     Ok(())
 }
@@ -69,8 +70,8 @@ fn check_joints_unanswered(session: &mut Session<'_>) -> Result<(), StopReason> 
         let exchange = session.exchange_messages(&[joints])?;
         session.check("JOINTS-5", exchange.is_silent(), || {
             format!(
-                "a cell without a configuration must not answer joints, but it answered those of a chain of \
-                 {count} joints"
+                "a cell without a configuration must not answer joints messages, but it answered that of a \
+                 chain of {count} joints"
             )
         });
         session.exchange_messages(&[joints])?;
@@ -78,7 +79,7 @@ fn check_joints_unanswered(session: &mut Session<'_>) -> Result<(), StopReason> 
     let after = session.counters()?;
     let skipped = after.heard.joints_late.wrapping_sub(before.heard.joints_late);
     session.check("JOINTS-4", skipped == 0, || {
-        format!("a cell without a configuration must not skip joints, but it skipped {skipped}")
+        format!("a cell without a configuration must not skip joints messages, but it skipped {skipped}")
     });
     let counted = after.heard.joints.wrapping_sub(before.heard.joints);
     session.check("JOINTS-2", counted == u16::from(most), || {
@@ -90,8 +91,8 @@ fn check_joints_unanswered(session: &mut Session<'_>) -> Result<(), StopReason> 
     let repeated = after.heard.joints_repeated.wrapping_sub(before.heard.joints_repeated);
     session.check("JOINTS-3", repeated == u16::from(most), || {
         format!(
-            "{most} joints messages were sent twice to a cell without a configuration, but it counted \
-             {repeated} as repeated"
+            "if {most} joints messages are sent twice, a cell without a configuration must count {most} as \
+             repeated, but it counted {repeated}"
         )
     });
     let wrong = [

@@ -150,15 +150,15 @@ impl Session<'_> {
         let count = torques.len();
         self.check("JOINTS-6", count <= 1, || {
             format!(
-                "the cell must answer joints of epoch {epoch} with at most one torque message, but it sent \
-                 {count}"
+                "the cell must answer the joints message of epoch {epoch} with at most one torque message, but \
+                 it sent {count}"
             )
         });
         for other in exchange.answers.iter().filter(|heard| heard.torque().is_none()) {
             if let Some(id) = self.known.violated_requirement(&other.message) {
                 let kind = other.message.id().kind.name();
                 self.check(id, false, || {
-                    format!("the cell must not answer joints with a {kind} packet, but it sent one")
+                    format!("the cell must not answer a joints message with a {kind} packet, but it sent one")
                 });
             }
         }
@@ -185,7 +185,7 @@ impl Session<'_> {
                     _ if halted => "the cell is halted and must not send a torque message, but it sent one",
                     _ => "the cell is not in contact and must not answer, but it sent a torque message",
                 };
-                format!("joints of epoch {epoch}: {what}")
+                format!("joints message of epoch {epoch}: {what}")
             });
         }
         if let Some((at, of, words)) = first {
@@ -199,8 +199,8 @@ impl Session<'_> {
             }
             self.check("JOINTS-6", of.0 == epoch, || {
                 format!(
-                    "the torque message that answers joints of epoch {epoch} must have this epoch, but it \
-                     has {of}"
+                    "the torque message that answers the joints message of epoch {epoch} must have this epoch, \
+                     but it has {of}"
                 )
             });
             if due == Some(ExpectedAnswer::Zeros) {

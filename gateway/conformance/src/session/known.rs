@@ -126,8 +126,8 @@ impl Session<'_> {
         if let Some(expected) = known.epoch {
             self.check("JOINTS-3", epoch.0 == expected, || {
                 format!(
-                    "a heartbeat must have the epoch of the last accepted joints, {expected}, but it has \
-                     {epoch}"
+                    "a heartbeat must have the epoch of the last accepted joints message, {expected}, but it \
+                     has {epoch}"
                 )
             });
         }

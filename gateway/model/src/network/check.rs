@@ -144,7 +144,7 @@ pub enum Difference {
     Circle(Vec<CellId>),
     /// Cells without a route to a root.
     #[error(
-        "{} {} no route to a root: their torques are missing from all sums; check their wires",
+        "{} {} no route to the gateway: their torques are missing from all sums; check their wires",
         cell_list(.0),
         if .0.len() == 1 { "has" } else { "have" }
     )]
@@ -154,8 +154,8 @@ pub enum Difference {
 fn other_cell_message(cell: CellId, serial: u32, described: u32, belongs: Option<CellId>) -> String {
     match belongs {
         Some(belongs) => format!(
-            "the cell with serial number {serial} uses node id {cell}, but in the skin it is cell {belongs}, and cell \
-             {cell} has serial number {described}: swap the cells, or their serial numbers in the skin"
+            "the cell with serial number {serial} uses node id {cell}, but in the skin it is cell {belongs}: swap the \
+             cells, or their serial numbers in the skin"
         ),
         None => format!(
             "cell {cell} has serial number {serial}, but {described} in the skin: write {serial} into the skin, or \

@@ -84,7 +84,8 @@ impl FaultEntry<'_> {
     fn wire_fault(&self, link_down: bool, keys: &[&str]) -> Checked<FaultKind> {
         self.refuse_other_keys(keys)?;
         if self.raw.all {
-            return Err(self.at.with_key("all").fault(true, "name the two cells of the wire with cells"));
+            let why = "use the key cells to name the two cells that the wire connects";
+            return Err(self.at.with_key("all").fault(true, why));
         }
         let (from, to) = self.names.wired_pair(self.selection())?;
         Ok(FaultKind::Wire { link_down, from, to, both_ways: !self.raw.one_way.unwrap_or(false) })

@@ -259,7 +259,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("force_n = 3.0", "force_n = 96.0"),
-        "s.toml:23: touch[0].force_n = 96: must be 0 to 95.997 N, the range of three contact words"
+        "s.toml:23: touch[0].force_n = 96: must be 0 to 95.997 N, what a cell's three contact sensors can report"
     );
     assert_eq!(
         says("\"step\"", "\"poke\""),

@@ -222,8 +222,8 @@ fn chains_that_are_too_long() {
     };
     assert_eq!(
         chain(&reaching(0.8), "l4"),
-        "t.urdf: link \"l4\" can be up to 2.100 m from the frame of a preceding row, if all joints turn freely; \
-         it must be less than 1.999 m: choose a root and a tip that are nearer to each other"
+        "t.urdf: link \"l4\" is too far from an earlier link of its chain: the distance can reach 2.100 m, but must be \
+         below 1.999 m: choose a root and a tip that are nearer to each other"
     );
     assert_eq!(good(&reaching(0.8), "l3").rows.len(), 3);
     assert_eq!(good(&reaching(0.74), "l4").rows.len(), 3);

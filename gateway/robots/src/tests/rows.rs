@@ -172,7 +172,7 @@ fn rows_do_not_fold_back_beside_the_robot() {
         assert!(chain.residual < 1e-14, "{}", chain.residual);
     }
     let long = Urdf::parse("t.urdf", &robot(&tilted_shoulder(1.7))).unwrap().chain(None, "l8").unwrap_err();
-    assert!(long.to_string().contains("can be up to 2."), "{long}");
+    assert!(long.to_string().contains("the distance can reach 2."), "{long}");
 }
 
 /// The path from joint to joint, with a fixed row for each, is an upper bound.

@@ -88,9 +88,9 @@ fn description(reason: &Error) -> String {
         Error::NonXmlChar(letter, _) => {
             format!("the character U+{:04X} cannot be in XML: delete it", u32::from(*letter))
         }
-        Error::InvalidAttributeValue(_) => plain("the value of an attribute contains <: write &lt; instead"),
-        Error::InvalidCharacterData(_) => plain("a text contains ]]>: write ]]&gt; instead"),
-        Error::InvalidComment(_) => plain("a comment contains -- or ends with -: delete the comment"),
+        Error::InvalidAttributeValue(_) => plain("an attribute value contains `<`: write `&lt;` instead"),
+        Error::InvalidCharacterData(_) => plain("a text contains `]]>`: write `]]&gt;` instead"),
+        Error::InvalidComment(_) => plain("a comment contains `--` or ends with `-`: delete the comment"),
         other => {
             let (text, place) = (other.to_string(), format!(" at {}", other.pos()));
             let text = text.strip_suffix(place.as_str()).unwrap_or(&text);

@@ -47,7 +47,7 @@ pub enum PartsError {
     #[error("{} is named twice: name it once", .0.display())]
     Same(PathBuf),
     /// Standard input (`-`) is listed together with other files.
-    #[error("- is standard input, which cannot be one of several files: name only files")]
+    #[error("- (standard input) cannot be combined with other files: name only files")]
     StandardInput,
     /// Two parts belong to different recordings.
     #[error(

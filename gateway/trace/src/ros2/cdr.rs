@@ -212,7 +212,8 @@ pub enum CdrError {
     Identifier(#[from] IdentifierError),
     /// A time is out of range.
     #[error(
-        "the time of a message is {sec} s and {nanosec} ns: use at least 0 s and less than 1000000000 ns"
+        "the time of a message is {sec} s and {nanosec} ns: seconds must not be negative, and nanoseconds must be \
+         from 0 to 999999999"
     )]
     Time {
         /// Seconds since 1970.

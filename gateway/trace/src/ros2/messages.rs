@@ -82,7 +82,7 @@ pub fn decode_frame(message: &[u8], time: Timestamp) -> Result<Record<'_>, CdrEr
     let wrong = value_error(
         "length",
         length,
-        "that of the data, which a remote frame does not have; 8 in a classic frame, 64 in an FD one",
+        "the length of the data, at most 8 in a classic frame or 64 in an FD frame; a remote frame has no data",
     );
     let frame = match is_remote {
         false if data.len() == usize::from(length) => Frame::with_data(id, format, flags, data),
@@ -197,9 +197,10 @@ mod tests {
         assert!(with(21, 8).ends_with("800 does not fit an identifier of 11 bits: at most 7FF"));
         assert!(with(28, 1).starts_with("flags of a message is 1; allowed: 0 to 15 in an FD frame"));
         assert!(with(30, 14).starts_with("raw_dlc of a message is 14; allowed: 0; 9 to 15"));
-        let time = "the time of a message is -1 s and 0 ns: use at least 0 s and less than 1000000000 ns";
+        let time = "the time of a message is -1 s and 0 ns: seconds must not be negative, and nanoseconds must be \
+                    from 0 to 999999999";
         assert_eq!(back_from_1969(&buffer), time);
-        assert!(with(29, 1).starts_with("length of a message is 1; allowed: that of the data"));
+        assert!(with(29, 1).starts_with("length of a message is 1; allowed: the length of the data"));
         assert!(with(31, 3).starts_with("direction of a message is 3; allowed: 0, 1 or 2"));
     }
 

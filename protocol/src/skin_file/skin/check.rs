@@ -100,7 +100,7 @@ fn check_sum_tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Ch
     let hint = if max > 0 {
         format!("use at most {max} us")
     } else {
-        "no slots fit: send joints less often, or use more roots or buses".to_owned()
+        "no slots fit: send joints messages less often, or use more roots or buses".to_owned()
     };
     let why = format!(
         "the tree needs {slots} slots within the {period_us} us between two joint broadcasts: {hint}"

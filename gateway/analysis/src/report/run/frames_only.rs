@@ -78,8 +78,8 @@ impl FramesOnlyCapture {
         });
         let has_torque = motion.distributed.iter().any(|line| line.points().iter().any(|(_, y)| *y != 0.0));
         let all = [
-            (!has_joints, "joints messages, and so no torques and replies"),
-            (has_torque && !compared, "stimuli or sensors, and so no central torques"),
+            (!has_joints, "joints messages, and therefore no torques or replies"),
+            (has_torque && !compared, "stimuli or sensors, and therefore no central torques"),
             (true, "joint velocities"),
             (true, "ticks and cycle times"),
             (true, "the scenario"),
@@ -127,6 +127,6 @@ mod tests {
         assert_eq!(motion.changes, [(1.0, "halted"), (2.0, "resumed")]);
         assert!((motion.duration_s() - 3.0).abs() < 1e-9);
         let missing = frames_only.missing_parts(&[], &motion);
-        assert_eq!(missing.first(), Some(&"joints messages, and so no torques and replies"));
+        assert_eq!(missing.first(), Some(&"joints messages, and therefore no torques or replies"));
     }
 }

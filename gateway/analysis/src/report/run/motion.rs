@@ -90,7 +90,7 @@ impl TickSeries {
         if self.comparing.is_some_and(|before| before != compared) {
             self.record_change(
                 at,
-                if compared { "central computation on" } else { "central computation off" },
+                if compared { "with central computation" } else { "without central computation" },
             );
         }
         self.comparing = Some(compared);

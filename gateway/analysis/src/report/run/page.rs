@@ -135,9 +135,19 @@ impl PageDraft<'_> {
         let farthest =
             farthest.max_by(|one, other| one.1.total_cmp(&other.1)).map(|(at, _)| self.view_command(at));
         for (what, theirs, errors, is_whole) in [
-            ("torques of single cells, loaded joints", paper::SINGLE_CELL_ERROR_NM, accuracy.single, false),
-            ("the whole skin's torque, all joints", paper::SUMMED_ERROR_NM, accuracy.whole, true),
-            ("sums along the tree, loaded joints", paper::SUMMED_ERROR_NM, accuracy.sums, true),
+            (
+                "torques of single cells, at the joints that they load",
+                paper::SINGLE_CELL_ERROR_NM,
+                accuracy.single,
+                false,
+            ),
+            ("the whole skin's torque, at all joints", paper::SUMMED_ERROR_NM, accuracy.whole, true),
+            (
+                "sums along the tree, at the joints that their cells load",
+                paper::SUMMED_ERROR_NM,
+                accuracy.sums,
+                true,
+            ),
         ] {
             let finding = |mean| {
                 let what = format!("{what}: mean absolute error");
@@ -154,7 +164,8 @@ impl PageDraft<'_> {
             let [of_active, of_each, of_none] = PAPER_CENTRAL_TIME_US;
             let law = of_active * active + of_each * skin.cells.len() as f64 + of_none;
             let what = format!(
-                "central computation per tick, median (paper: value of its formula for {} cells, {} of them active on average)",
+                "median of the central computation per tick (paper: value of its formula for {} cells, {} of them \
+                 active on average)",
                 skin.cells.len(),
                 format_number((active * 10.0).round() / 10.0)
             );

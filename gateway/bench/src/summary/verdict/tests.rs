@@ -152,7 +152,7 @@ const CASES: &[Case] = &[
         let contributions = Contributions { due: 900, in_time: 895, missing: 5, ..Contributions::default() };
         it.buses[0].sums = Some(SumsSummary { contributions, ..SumsSummary::default() });
     }),
-    ("cell 4 on vcan0: no route to a root at the end", |it| network(it).unreachable = vec![4]),
+    ("cell 4 on vcan0: no route to the gateway at the end", |it| network(it).unreachable = vec![4]),
     ("vcan0 differs from the skin: cell 2 has no wire", |it| {
         network(it).differences.push("cell 2 has no wire".to_owned());
     }),
@@ -188,7 +188,7 @@ const CASES: &[Case] = &[
     }),
     ("the gateway could not send 3 frames, ", |it| it.control.unsent = 3),
     (
-        "17772 replies due on vcan0: 9 late, 2 skipped, because the cells received the joints too late; ",
+        "17772 replies due on vcan0: 9 late, 2 skipped, because joints messages reached the cells late; ",
         |it| {
             let replies = &mut it.buses[0].replies;
             replies.in_time -= 11;

@@ -307,11 +307,12 @@ fn check_silent_after_giving_way(
     let serial = session.about.serial.unwrap_or_default();
     session.check("CLAIM-3", came == 0, || {
         format!(
-            "the cell (serial number {serial}) must give way to {what}, but it sent {came} packets after it"
+            "once the cell (serial number {serial}) receives {what}, it must stop sending, but it then sent \
+             {came} packets"
         )
     });
     session.check("CLAIM-4", came == 0, || {
-        format!("the cell must be silent after it gave way to {what}, but it sent {came} packets")
+        format!("after the cell gave way to {what}, it must be silent, but it sent {came} packets")
     });
     Ok(())
 }

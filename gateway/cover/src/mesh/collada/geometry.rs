@@ -233,7 +233,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
         let array = named.or_else(|| child(source, "float_array").map(Ok));
         let array = array.ok_or_else(|| self.error("a source has no numbers"))??;
         let values = floats(self.name, array)?;
-        self.check_count(array, "numbers of a source", values.len())?;
+        self.check_count(array, "numbers in a float_array", values.len())?;
         let values = values.get(number("offset").unwrap_or(0)..).unwrap_or_default();
         let stride = number("stride").unwrap_or(3);
         if stride < 3 {

@@ -138,7 +138,7 @@ fn polygons_of_each_kind_have_their_own_area() {
         assert!(error.contains(words), "{error}");
     }
     let short = file(&geometry("a", 0.0, TRIANGLES), &placed(&["a"]), "").replace("  0 0 3<", "<");
-    assert!(parse(&short).unwrap_err().contains("the file has 9 numbers of a source, but announces 12"));
+    assert!(parse(&short).unwrap_err().contains("the file has 9 numbers in a float_array, but announces 12"));
 }
 
 #[test]

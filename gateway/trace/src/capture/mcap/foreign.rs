@@ -65,7 +65,7 @@ impl ForeignMessageType {
         let wrong = CdrError::Value {
             what: "length",
             got: length.into(),
-            allowed: "8 in a classic frame, 64 in an FD one, and not more than there is data",
+            allowed: "at most 8 in a classic frame or 64 in an FD frame, and no more than the data available",
         };
         let id = check_identifier(number, remote | extended | error)?;
         let frame = match self {

@@ -55,7 +55,7 @@ impl PageDraft<'_> {
         if !loaded.is_empty() {
             let when = if self.run.frames_only.is_some() { "before each broadcast" } else { "at each tick" };
             section = section.with_paragraph(format!("The upper curve is the sum of the torques received {when}. The lower curve is the \
-             difference, once per epoch, between the sum of all cells' answers and the central computation for the same joints; an epoch without an \
+             difference, once per epoch, between the sum of all cells' answers and the central computation for the same positions; an epoch without an \
              answer in time is a gap. Dotted lines: one step of the torque words."));
             let is_compared = self.run.bus_figures.iter().any(|it| it.lines.error.point_count() > 0);
             let lacks =

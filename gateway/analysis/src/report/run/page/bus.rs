@@ -227,7 +227,8 @@ impl PageDraft<'_> {
         let text = "On this bus a frame took no time. On a real bus it takes the time of its bits, including its stuff bits. \
                     This run is rated by its second with the highest load; the worst case assumes that all cells answer \
                     with the longest possible frames. Frames that only a bench sends are left out: stimuli, sync and \
-                    report with their answers, and simulated wires. Start-up, before the first joints, is shown separately.";
+                    report with their answers, and simulated wires. Start-up, before the first joints message, \
+                    is shown separately.";
         let assumed = self.run.bus_figures.iter().any(|bus_figures| !bus_figures.rates.is_chosen);
         let mut section = Section::new("load", "Load of the buses").with_paragraph(text);
         if assumed {
@@ -263,8 +264,8 @@ impl PageDraft<'_> {
             row(format!("{name}: frames recorded"), bus_figures.frames, true);
             row(format!("{name}: frames that the recorder reported as lost"), bus_figures.dropped, true);
             row(format!("{name}: packets that cells sent, by their own count"), uplink.sent, true);
-            row(format!("{name}: packets lost, of those that cells sent"), uplink.lost, true);
-            row(format!("{name}: packets refused, of those that cells sent"), uplink.rejected, false);
+            row(format!("{name}: packets that cells sent, but that were lost"), uplink.lost, true);
+            row(format!("{name}: packets that cells sent, but that were refused"), uplink.rejected, false);
             row(format!("{name}: restarts of cells during the run"), u64::from(uplink.restarts), false);
             for event in FrameEvent::ALL {
                 row(
@@ -305,8 +306,11 @@ fn load_table(bus: &BusShadow) -> Table {
         row([run.case_name(), &run.verdict.to_string(), &share(bus.load.mean), &second, &short, &cells]);
     }
     if let Some(start) = &bus.start_up {
-        let frames =
-            format!("{} frames in {}, without joints", start.frames, format_quantity(start.duration_s, "s"));
+        let frames = format!(
+            "{} frames in {}, without joints messages",
+            start.frames,
+            format_quantity(start.duration_s, "s")
+        );
         let [second, short] =
             [start.load.worst_1_s, start.load.worst_16_ms].map(|it| format_percent(it.value));
         row(["start-up", "", &share(start.load.mean), &second, &short, &frames]);

@@ -76,7 +76,9 @@ impl PageDraft<'_> {
                     Notice::Revived(node) => format!("{name}: cell {node} sends again"),
                     Notice::Restarted(node) => format!("{name}: cell {node} restarted"),
                     Notice::Duplicate(node) => {
-                        format!("{name}: cell {node} received packets of another cell with its node id")
+                        format!(
+                            "{name}: cell {node} received packets from another cell that uses the same node id"
+                        )
                     }
                     Notice::OtherGateway => format!("{name}: another gateway sends on this bus"),
                     Notice::Returned(_) => return None,

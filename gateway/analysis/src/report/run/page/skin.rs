@@ -36,8 +36,8 @@ impl PageDraft<'_> {
         let section = match (self.touch_strip(), force) {
             (Some(strip), Some(force)) => section
                 .with_paragraph(
-                    "Algorithm 1 computes each force from the cell's sensors; the force holds from the joints message \
-                     that latched it to the next one.",
+                    "Algorithm 1 computes each force from the cell's sensors. A joints message latches the force, which is \
+                     used until the next joints message.",
                 )
                 .with_drawings([Drawing::Strip(strip), Drawing::Map(force)])
                 .with_tables(self.touch_table()),
