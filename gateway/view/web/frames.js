@@ -65,7 +65,7 @@ function rowOf(frame, key, ask) {
   if (!frame.is_torque) return row;
   const button = element("button", "Why");
   button.type = "button";
-  button.setAttribute("aria-label", `Explain the torque at ${frame.at_s.toFixed(4)} s`);
+  button.setAttribute("aria-label", `Why: explain the torque at ${frame.at_s.toFixed(4)} s`);
   button.onclick = () => {
     asked = sought = frame.number;
     hold(true);
