@@ -177,7 +177,7 @@ impl TorqueRounding {
 
 /// Converts steps to a word, without a check of the range.
 #[inline]
-fn low_16_bits(steps: i32) -> i16 {
+pub(crate) fn low_16_bits(steps: i32) -> i16 {
     debug_assert!(i16::try_from(steps).is_ok(), "{steps} is no word");
     let [low, high, ..] = steps.to_le_bytes();
     i16::from_le_bytes([low, high])

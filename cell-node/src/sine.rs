@@ -18,6 +18,8 @@ use core::f64::consts::FRAC_PI_2;
 
 use protocol::fixed::Q1_14;
 
+use crate::contact::low_16_bits;
+
 #[cfg(any(feature = "oracle", feature = "earlier-sine"))]
 mod odd_polynomial;
 #[cfg(feature = "oracle")]
@@ -57,8 +59,7 @@ pub fn cosine(angle: Q1_14) -> Q1_14 {
 
 /// Converts a sine or cosine in steps of 2^-14 to a word.
 fn word_within_one(steps: i32) -> Q1_14 {
-    let [low, high, ..] = steps.to_le_bytes();
-    Q1_14::from_bits(i16::from_le_bytes([low, high]))
+    Q1_14::from_bits(low_16_bits(steps))
 }
 
 /// Returns [`sine`] and [`cosine`] of one angle in steps of 2^-14.

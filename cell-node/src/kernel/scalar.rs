@@ -6,20 +6,18 @@ use core::ops::{Add, Mul, Neg, Sub};
 
 use protocol::fixed::{Accumulator, Q1_14};
 
+use crate::contact::low_16_bits;
 use crate::sine::{PRECISE_SINE_FRACTION_BITS, precise_sine_cosine, sine_cosine};
 
 /// The result type of a kernel, and the number type of its computation.
 pub trait Scalar: Copy {
+    /// True for the cell's own word, [`Q1_14`]. Assembly computes with this type only.
+    const IS_CELL_WORD: bool = false;
     /// The number type of the computation.
     type Number: Number;
 
     /// Converts an element of J from the number that the kernel computes with to the type that it returns.
     fn from_number(number: Self::Number) -> Self;
-    /// Returns the number as a word, if this type is the cell's [`Q1_14`]. Assembly computes with this type only.
-    #[must_use]
-    fn cell_word(_number: Self::Number) -> Option<Q1_14> {
-        None
-    }
 }
 
 /// A number type for kernels, with the wider type of its sums of products.
@@ -171,20 +169,18 @@ impl Word for Q1_14 {
 }
 
 impl<W: Word> Scalar for W {
+    const IS_CELL_WORD: bool = W::IS_CELL_WORD;
     type Number = FixedPoint<W>;
 
     #[inline]
     fn from_number(number: FixedPoint<W>) -> Self {
-        Self::from_word(number.to_word())
-    }
-
-    fn cell_word(number: FixedPoint<W>) -> Option<Q1_14> {
-        W::IS_CELL_WORD.then(|| number.to_word())
+        Self::from_word(Q1_14::from_bits(low_16_bits(number.steps)))
     }
 }
 
 /// A number within the range of a word, in steps of 2^-14. It is stored in 32 bits, the width of a register. Products
 /// and sums also take 32 bits.
+#[repr(transparent)]
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FixedPoint<W> {
     steps: i32,
@@ -195,12 +191,6 @@ impl<W> FixedPoint<W> {
     #[inline]
     const fn new(steps: i32) -> Self {
         Self { steps, of: PhantomData }
-    }
-
-    #[inline]
-    fn to_word(&self) -> Q1_14 {
-        let [low, high, ..] = self.steps.to_le_bytes();
-        Q1_14::from_bits(i16::from_le_bytes([low, high]))
     }
 
     /// Converts a sum in steps of 2^-28 to steps of 2^-14, with saturation. The caller has added half a step of 2^-14

@@ -67,6 +67,8 @@ pub struct Wrench<S: Scalar = Q1_14> {
 }
 
 /// A force of one newton and its moment in m (Nm per N), or one property of each of their components.
+// Assembly reads it.
+#[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct PerComponent<T> {
     force: [T; 3],
@@ -186,7 +188,7 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
     #[inline(always)]
     fn write_jacobian(&self, joints: &[Q1_14; MAX_JOINTS], jacobian: &mut [S; MAX_JOINTS]) {
         #[cfg(armv6m)]
-        if self.program.write_jacobian(joints, jacobian) {
+        if self.write_jacobian_in_assembly(joints, jacobian) {
             return;
         }
         self.write_jacobian_in_rust(joints, jacobian);

@@ -14,7 +14,7 @@ use core::arch::global_asm;
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, RowKind};
 
-use super::{ChainLink, PerComponent, Scalar, Wrench, due};
+use super::{ChainLink, Scalar, Wrench, due};
 use crate::contact::MAX_JACOBIAN_STEPS;
 use crate::kernel::Twist;
 
@@ -24,7 +24,12 @@ global_asm!(include_str!("cortex_m0.s"), options(raw));
 type Handler = unsafe extern "C" fn();
 
 unsafe extern "C" {
-    fn skinbus_wrench(program: *const Program, positions: *const i16, jacobian: *mut i16);
+    fn skinbus_wrench(
+        program: *const Program,
+        positions: *const i16,
+        jacobian: *mut i16,
+        contact: *const i32,
+    );
     // A turn, a twist and a shift.
     fn skinbus_wrench_ahead_d();
     fn skinbus_wrench_back_d();
@@ -47,12 +52,10 @@ unsafe extern "C" {
     fn skinbus_wrench_return();
 }
 
-/// What the assembly reads. The assembly knows this layout.
+/// The input of the assembly for one chain. The assembly is written for this layout.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Program {
-    /// Force x and y, moment x, y and z, force z of the contact.
-    contact: [i32; 6],
     /// Twice the index of the joint that moves the cell; negative if this chain is left to the Rust code.
     joint: i32,
     /// The steps down to joint 1, and an end mark.
@@ -64,10 +67,10 @@ pub(super) struct Program {
 #[derive(Clone, Copy, Debug)]
 struct Step {
     handler: Handler,
-    /// The constant theta_offset of the upper joint, as an unsigned word.
-    offset: u32,
+    /// The constant theta_offset of the upper joint.
+    offset: Q1_14,
+    a: Q1_14,
     d: i32,
-    a: i32,
     twist: Handler,
     shift: Handler,
 }
@@ -82,7 +85,7 @@ impl PartialEq for Step {
 impl Step {
     const END: Self = {
         let handler = skinbus_wrench_return;
-        Self { handler, offset: 0, d: 0, a: 0, twist: handler, shift: handler }
+        Self { handler, offset: Q1_14::ZERO, a: Q1_14::ZERO, d: 0, twist: handler, shift: handler }
     };
 
     /// Creates the step from the joint of one link to the joint of the next. Returns `None` for a next link whose twist
@@ -112,77 +115,61 @@ impl Step {
             (Twist::None, false, true) => skinbus_wrench_y_a,
             _ => skinbus_wrench_any,
         };
-        let offset = u32::from(link.offset.to_bits().cast_unsigned());
-        let [d, a] = [next.d, next.a].map(|length| i32::from(length.to_bits()));
-        Some(Self { handler, offset, d, a, twist, shift })
+        let (offset, a, d) = (link.offset, next.a, i32::from(next.d.to_bits()));
+        Some(Self { handler, offset, a, d, twist, shift })
     }
 }
 
 impl Program {
     /// A program for chains that are left to the Rust code.
-    pub(super) const NONE: Self = Self { contact: [0; 6], joint: -1, steps: [Step::END; MAX_JOINTS] };
+    pub(super) const NONE: Self = Self { joint: -1, steps: [Step::END; MAX_JOINTS] };
 
-    /// Prepares the program for a contact and the links from the joint that moves the cell down to joint 1, if the
-    /// assembly can compute J for them.
-    pub(super) fn prepare<S: Scalar>(
-        &mut self,
-        contact: &PerComponent<S::Number>,
-        links: &[ChainLink<S::Number>],
-    ) {
-        self.joint = self.translate::<S>(contact, links).unwrap_or(-1);
-    }
-
-    /// Writes contact and steps. Returns twice the index of the joint that moves the cell.
-    fn translate<S: Scalar>(
-        &mut self,
-        contact: &PerComponent<S::Number>,
-        links: &[ChainLink<S::Number>],
-    ) -> Option<i32> {
-        let PerComponent { force: [fx, fy, fz], moment: [mx, my, mz] } = *contact;
-        for (to, number) in self.contact.iter_mut().zip([fx, fy, mx, my, mz, fz]) {
-            *to = i32::from(S::cell_word(number)?.to_bits());
-        }
-        if links.len() > MAX_JOINTS || links.iter().any(|link| link.kind != RowKind::Revolute) {
+    /// Writes the steps for the links from the joint that moves the cell down to joint 1. Returns twice the index of
+    /// that joint, or `None` if the assembly cannot compute J for them.
+    fn translate<N>(&mut self, links: &[ChainLink<N>]) -> Option<i32> {
+        if links.iter().any(|link| link.kind != RowKind::Revolute) {
             return None;
         }
         let last = links.len().checked_sub(1)?;
+        *self.steps.get_mut(last)? = Step::END;
         for ((number, to), pair) in self.steps.iter_mut().enumerate().zip(links.windows(2)) {
             let [link, next] = pair else { return None };
             *to = Step::new(link, next, number + 1 == last)?;
         }
-        *self.steps.get_mut(last)? = Step::END;
         i32::try_from(2 * last).ok()
     }
 
     /// Returns true if the assembly computes J.
-    #[cfg(feature = "oracle")]
     pub(super) const fn is_prepared(&self) -> bool {
         self.joint >= 0
-    }
-
-    /// Writes J. Returns false if this chain is left to the Rust code.
-    #[inline(always)]
-    pub(super) fn write_jacobian<S: Scalar>(
-        &self,
-        joints: &[Q1_14; MAX_JOINTS],
-        jacobian: &mut [S; MAX_JOINTS],
-    ) -> bool {
-        if self.joint < 0 {
-            return false;
-        }
-        // SAFETY: a program was prepared only if `S` is the cell's word (`Scalar::cell_word`), which has the
-        // representation of `i16`, as the joints have. The assembly reads the program up to its end mark, and from both
-        // arrays the elements of joint 1 up to `self.joint`, which is within them.
-        unsafe { skinbus_wrench(self, joints.as_ptr().cast(), jacobian.as_mut_ptr().cast()) };
-        true
     }
 }
 
 impl<S: Scalar> Wrench<S> {
     /// Leaves this chain to the assembly, if it can compute J for it.
     pub(super) fn prepare_program(&mut self) {
-        let is_bounded = self.bound < MAX_JACOBIAN_STEPS;
-        let links = self.links.get(..self.rows).filter(|_| is_bounded).unwrap_or_default();
-        self.program.prepare::<S>(&self.contact, links);
+        let is_for_assembly = S::IS_CELL_WORD && self.bound < MAX_JACOBIAN_STEPS;
+        let links = self.links.get(..self.rows).filter(|_| is_for_assembly);
+        self.program.joint = links.and_then(|links| self.program.translate(links)).unwrap_or(-1);
+    }
+
+    /// Writes J. Returns false if this chain is left to the Rust code.
+    #[inline(always)]
+    pub(super) fn write_jacobian_in_assembly(
+        &self,
+        joints: &[Q1_14; MAX_JOINTS],
+        jacobian: &mut [S; MAX_JOINTS],
+    ) -> bool {
+        let (program, contact) = (&self.program, &raw const self.contact);
+        if program.is_prepared() {
+            // SAFETY: a program was prepared only for the cell's word (`Scalar::IS_CELL_WORD`), which has the
+            // representation of `i16`, as the joints have, and whose numbers have that of `i32`. The assembly reads the
+            // whole contact, the program up to its end mark, and from both arrays the elements of joint 1 up to
+            // `program.joint`, which is within them.
+            unsafe {
+                skinbus_wrench(program, joints.as_ptr().cast(), jacobian.as_mut_ptr().cast(), contact.cast());
+            }
+        }
+        program.is_prepared()
     }
 }

@@ -1,6 +1,6 @@
 @ The wrench kernel for ARMv6-M. cortex_m0.rs prepares what it reads, and says which chains it is for.
 @
-@   void skinbus_wrench(const Program *program, const int16_t *positions, int16_t *jacobian)
+@   void skinbus_wrench(const Program *program, const int16_t *positions, int16_t *jacobian, const int32_t *contact)
 @
 @ The compiler cannot use the carry of a shift, which is the half step of rounding: `asrs #14; adcs #0`.
 @
@@ -10,14 +10,13 @@
 @   r6           step of the program           [sp]     force z
 @   r7           position of the joint         lr       from there to its element of J
 @
-@ A program: force x, y, moment x, y, z, force z; twice the index of the cell's joint; steps.
+@ A program: twice the index of the cell's joint; steps. The contact: force x, y, z, moment x, y, z.
     .set HANDLER, 0
-    .set OFFSET, 4              @ theta offset of the joint
+    .set OFFSET_A, 4            @ 16 bits of the theta offset of the joint, below 16 bits of a
     .set LENGTH_D, 8
-    .set LENGTH_A, 12
-    .set TWIST, 16              @ the rest of what skinbus_wrench_any does
-    .set SHIFT, 20
-    .set STEP, 24
+    .set TWIST, 12              @ the rest of what skinbus_wrench_any does
+    .set SHIFT, 16
+    .set STEP, 20
 
     .syntax unified
     .section .text.skinbus_wrench, "ax", %progbits
@@ -86,16 +85,16 @@ HANDLER_BEGIN skinbus_wrench
     mov     r7, r11
     push    {r4, r5, r6, r7}
     sub     sp, #4
-    ldmia   r0!, {r2, r3, r4, r5, r6, r7}
+    ldmia   r3!, {r2, r4, r5}
     mov     r8, r2
-    mov     r9, r3
-    mov     r10, r4
-    mov     r11, r5
-    mov     r12, r6
-    str     r7, [sp]
+    mov     r9, r4
+    str     r5, [sp]
+    ldmia   r3!, {r2, r4, r5}
+    mov     r10, r2
+    mov     r11, r4
+    mov     r12, r5
     ldmia   r0!, {r7}
     adds    r7, r7, r1
-    mov     r5, r6
     subs    r0, #STEP
     mov     r6, r0
     b       store
@@ -112,7 +111,8 @@ HANDLER_BEGIN skinbus_wrench_a
     TURN    r10, r11
     TURN    r8, r9
 shift_a:                                @ with force y in r1
-    ldr     r3, [r6, #LENGTH_A]
+    ldr     r3, [r6, #OFFSET_A]
+    asrs    r3, r3, #16
     muls    r1, r3, r1
     ADD     r1, r12, r5
     ldr     r0, [sp]
@@ -125,9 +125,9 @@ store:                                  @ the element of J in r5
     adds    r6, #STEP
 
 @ Sine and cosine of the angle: sine.rs has the polynomials.
-    ldr     r1, [r6, #OFFSET]
+    ldr     r1, [r6, #OFFSET_A]
     ldrh    r0, [r7]
-    adds    r0, r0, r1
+    adds    r0, r0, r1                  @ the angle in the low 16 bits
     lsls    r1, r0, #18
     asrs    r1, r1, #18                 @ z, from the nearest quarter turn
     mov     r2, r1
@@ -296,7 +296,8 @@ HANDLER_BEGIN skinbus_wrench_shift_none
 
 HANDLER_BEGIN skinbus_wrench_shift_d_a
     ldr     r3, [r6, #LENGTH_D]
-    ldr     r4, [r6, #LENGTH_A]
+    ldr     r4, [r6, #OFFSET_A]
+    asrs    r4, r4, #16
     mov     r5, r9
     mov     r0, r5
     muls    r0, r3, r0
