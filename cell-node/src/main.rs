@@ -1,6 +1,5 @@
 //! A process that runs one or several skin cells.
 
-use std::io::{self, Write as _};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -14,7 +13,7 @@ use protocol::id::CellId;
 use protocol::last_words::{CellRange, ExitReason};
 use protocol::sine::SineMethod;
 use protocol::skin::{BusWires, Skin, SkinReply};
-use protocol::usage::{exit_code, ignore_broken_pipe};
+use protocol::usage::{exit_code, flush_printed};
 use rustix::process::{Pid, Signal, getppid, set_parent_process_death_signal};
 
 /// Run one or several tactile skin cells, which receive joint positions and answer with joint torques
@@ -102,8 +101,7 @@ fn main() -> ExitCode {
         Ok(arguments) => arguments,
         // Help and version were requested and are printed unchanged.
         Err(requested) if !requested.use_stderr() => {
-            let printed = requested.print().and_then(|()| io::stdout().flush());
-            return exit_code("cell-node", ignore_broken_pipe(printed));
+            return exit_code("cell-node", flush_printed(requested.print()));
         }
         Err(wrong) => {
             eprint_line(protocol::usage::one_line_error(&wrong.render().to_string()));

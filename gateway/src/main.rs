@@ -39,12 +39,11 @@ mod surface;
 mod view;
 mod visuals;
 
-use std::io::{self, Write as _};
 use std::process::ExitCode;
 
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
-use protocol::usage::{Failure, exit_code, ignore_broken_pipe, one_line_error};
+use protocol::usage::{Failure, exit_code, flush_printed, one_line_error};
 
 /// A test bench for robot skin on CAN: runs cells, bridges their bus to a control loop, records, replays
 #[derive(Debug, Parser)]
@@ -117,9 +116,7 @@ fn main() -> ExitCode {
     let done = match parsed {
         Ok(arguments) => arguments.command.run(),
         // Print requested help and version unchanged.
-        Err(requested) if !requested.use_stderr() => {
-            ignore_broken_pipe(requested.print().and_then(|()| io::stdout().flush()))
-        }
+        Err(requested) if !requested.use_stderr() => flush_printed(requested.print()),
         Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
         Err(wrong) => Err(Failure::usage_error(usage_error(&wrong))),
     };

@@ -166,6 +166,14 @@ pub fn ignore_broken_pipe(done: io::Result<()>) -> Result<(), Failure> {
     }
 }
 
+/// Flushes standard output after another library has printed to it, such as requested help.
+///
+/// # Errors
+/// Returns a failure if printing or flushing failed, unless the reader has closed the pipe.
+pub fn flush_printed(printed: io::Result<()>) -> Result<(), Failure> {
+    ignore_broken_pipe(printed.and_then(|()| io::stdout().flush()))
+}
+
 /// Shortens clap's error message to one line. The line contains the error and clap's tip, but not the usage.
 #[must_use]
 pub fn one_line_error(text: &str) -> String {

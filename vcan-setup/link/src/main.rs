@@ -6,13 +6,13 @@ mod log;
 mod session;
 mod watchers;
 
-use std::io::{self, Write as _};
+use std::io;
 use std::os::unix::net::UnixStream;
 use std::process::ExitCode;
 
 use clap::Parser;
 use clap::error::ErrorKind;
-use protocol::usage::{Failure, exit_code, ignore_broken_pipe, one_line_error, print_text};
+use protocol::usage::{Failure, exit_code, flush_printed, one_line_error, print_text};
 use signal_hook::consts::{SIGINT, SIGTERM};
 use vcan_setup::hosts::options::LinkOptions;
 use vcan_setup::hosts::program;
@@ -33,9 +33,7 @@ fn main() -> ExitCode {
         program::check_caller().map_err(Failure::run_error).and_then(|()| match Arguments::try_parse() {
             Ok(arguments) => run(arguments.options),
             // The user requested help or the version; clap prints them.
-            Err(queried) if !queried.use_stderr() => {
-                ignore_broken_pipe(queried.print().and_then(|()| io::stdout().flush()))
-            }
+            Err(queried) if !queried.use_stderr() => flush_printed(queried.print()),
             Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
             Err(wrong) => Err(Failure::usage_error(one_line_error(&wrong.render().to_string()))),
         });

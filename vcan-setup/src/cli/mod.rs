@@ -8,7 +8,7 @@ mod status;
 mod up;
 
 use std::ffi::{OsStr, OsString};
-use std::io::{self, Write as _};
+use std::io;
 use std::path::Path;
 use std::process::ExitCode;
 
@@ -16,7 +16,7 @@ use clap::error::ErrorKind;
 use clap::{Parser, Subcommand};
 use protocol::bus::{BusError, check_name};
 use protocol::skin::Skin;
-use protocol::usage::{Failure, exit_code, ignore_broken_pipe, one_line_error, shell_quoted_os};
+use protocol::usage::{Failure, exit_code, flush_printed, one_line_error, shell_quoted_os};
 use serde::Serialize;
 use vcan_setup::hosts::options::LinkOptions;
 use vcan_setup::hosts::program;
@@ -73,9 +73,7 @@ pub(crate) fn main() -> ExitCode {
     let done = match Arguments::try_parse() {
         Ok(arguments) => arguments.command.run(),
         // The user requested help or the version; clap prints them.
-        Err(queried) if !queried.use_stderr() => {
-            ignore_broken_pipe(queried.print().and_then(|()| io::stdout().flush()))
-        }
+        Err(queried) if !queried.use_stderr() => flush_printed(queried.print()),
         Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
         Err(wrong) => Err(Failure::usage_error(one_line_error(&wrong.render().to_string()))),
     };
