@@ -20,6 +20,15 @@ impl SineMethod {
     /// All methods, the present one first.
     pub const ALL: [Self; 2] = [Self::Eighths, Self::SeventhOrder];
 
+    /// Returns the other method.
+    #[must_use]
+    pub const fn other(self) -> Self {
+        match self {
+            Self::Eighths => Self::SeventhOrder,
+            Self::SeventhOrder => Self::Eighths,
+        }
+    }
+
     /// Returns the name in recordings and on command lines.
     #[must_use]
     pub const fn name(self) -> &'static str {

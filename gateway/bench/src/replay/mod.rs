@@ -121,7 +121,7 @@ pub fn replay(options: &ReplayOptions) -> Result<Summary, ReplayError> {
     let Some(RecordedSine::Assumed(assumed)) = sine.filter(|_| first.has_other_torque_words()) else {
         return Ok(first);
     };
-    let other = if assumed == SineMethod::Eighths { SineMethod::SeventhOrder } else { SineMethod::Eighths };
+    let other = assumed.other();
     let progress = Progress::notes_only(options.quiet);
     progress.print_note(&format!(
         "{} does not state the sine of its cells, and {assumed} gives different torques: replaying it again with {other}",

@@ -132,10 +132,11 @@ impl Summary {
         !self.interrupted && tally.is_some_and(|tally| tally.different > 0 && tally.torque_words.max > 0)
     }
 
-    /// Returns true if fewer replies differ from the recorded ones than in another replay of the same capture.
+    /// Returns true if fewer replies differ from the recorded ones than in another replay of the same capture. A replay
+    /// that did not reach its end has not compared all of them, and counts as no better.
     pub(super) fn differs_less_than(&self, other: &Self) -> bool {
         let different = |it: &Self| it.expect.as_ref().map_or(u64::MAX, |expect| expect.tally.different);
-        different(self) < different(other)
+        !self.interrupted && self.failure.is_none() && different(self) < different(other)
     }
 
     /// Returns the reason why the replay failed, in one line, or `None` for success. Reasons that processes gave for

@@ -24,7 +24,7 @@ use super::{ReplayError, ReplayOptions};
 const RECENT_JOINTS: usize = 8;
 /// The lead in torques that only one sine explains, after which the decision is made.
 const DECISIVE_LEAD: u32 = 4;
-/// The number of frames that are read for it.
+/// The maximum number of frames that are read for the decision.
 const MAX_FRAMES: u64 = 2_000_000;
 
 /// The sine with which the cells of a capture computed.
@@ -58,20 +58,18 @@ pub(super) fn recorded_sine(
     while let Some(entry) = reader.next().map_err(ReplayError::Read)? {
         let CaptureEntry::Frame(record) = entry else { continue };
         frames += 1;
-        if let Some(sine) = evidence.decision().filter(|_| evidence.lead() >= DECISIVE_LEAD) {
-            return Ok(RecordedSine::Known(sine));
-        }
-        if frames > MAX_FRAMES {
-            break;
-        }
-        let bus = options.map.iter().find(|(from, _)| from == record.interface);
-        let bus = bus.map_or(record.interface, |(_, to)| to.as_str()).to_owned();
+        let route = options.map.iter().find(|(from, _)| from == record.interface);
+        let bus = route.map_or(record.interface, |(_, to)| to.as_str());
         let now = Micros(record.time.nanos / 1_000);
         if let Decoded::Message(message) = evidence.decoder.decode(now, record.interface, &record.frame) {
-            evidence.add_message(&bus, &message);
+            evidence.add_message(bus, &message);
+        }
+        if evidence.lead() >= DECISIVE_LEAD || frames == MAX_FRAMES {
+            break;
         }
     }
-    Ok(RecordedSine::Assumed(evidence.decision().unwrap_or(SineMethod::SeventhOrder)))
+    let sine = evidence.decision().unwrap_or(SineMethod::SeventhOrder);
+    Ok(if evidence.lead() >= DECISIVE_LEAD { RecordedSine::Known(sine) } else { RecordedSine::Assumed(sine) })
 }
 
 /// Counts of the torques that only one of two sines explains.

@@ -343,7 +343,7 @@ fn row() -> Vec<Message> {
     all
 }
 
-/// The same cells side by side: all are roots.
+/// Returns the messages of [`row`] with cells side by side, all of them roots.
 fn beside(own: [i16; 2]) -> Vec<Message> {
     let mut all = row();
     all[4] = tree(2, 0, Some(0));
