@@ -115,7 +115,7 @@ mod tests {
             (what(5), what(6)),
             (
                 "worst case of one bus at 1M/5M: does not fit: bandwidth (all 253 cells answer)",
-                "worst case of one bus at 1M/8M: in time, but too many nodes: 254 (all 253 cells answer)"
+                "worst case of one bus at 1M/8M: in time, but 254 nodes (all 253 cells answer)"
             )
         );
         assert!((section.findings[5].ours.value - 118.9).abs() < 0.05);

@@ -139,14 +139,13 @@ fn four_commands_give_the_same_figures_for_one_skin_in_the_same_words() {
     assert_eq!(row(&shadow, "worst case"), worst);
     let run = row(&shadow, "this run");
     let (load, verdict) = run[0].split_once(": ").unwrap();
-    assert_eq!((verdict, run[1]), ("in time, but too many nodes: 254", "at most 120 of 253 cells answered"));
+    assert_eq!((verdict, run[1]), ("in time, but 254 nodes", "at most 120 of 253 cells answered"));
     assert_eq!(row(&shadow, "most in any second")[0], load);
     let of_log = files.gateway("fit run.log --skin skin.toml");
     assert_eq!((row(&of_log, "worst case"), row(&of_log, "this run")), (worst, run));
     let unknown = files.gateway("fit run.log --nominal 1M --data 5M");
     assert_eq!(row(&unknown, "worst case")[0], "?");
-    // The rest is in the next line.
-    assert_eq!(row(&unknown, "this run"), [run[0], "at most 120 of 253 observed cells"]);
+    assert_eq!(row(&unknown, "this run"), [run[0], "at most 120 of 253 observed cells answered"]);
 
     let report = files.report("");
     let at = "vcan0 at 1M/5M";
@@ -223,6 +222,6 @@ fn default_rates_are_shown_and_not_rated() {
     );
     assert!(!text.contains("not met"), "{text}");
     let rated = files.report(" --nominal 1M --data 8M");
-    assert!(rated.contains("vcan0 at 1M/8M, worst case: in time, but too many nodes: 254"), "{rated}");
+    assert!(rated.contains("vcan0 at 1M/8M, worst case: in time, but 254 nodes"), "{rated}");
     assert!(rated.contains("110 nodes (--nominal, --data) ✗ not met"), "{rated}");
 }

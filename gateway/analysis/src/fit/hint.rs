@@ -102,7 +102,7 @@ fn hint_for_event_sensing(case: &BusCase) -> Option<Hint> {
         Sensing::Off | Sensing::Event => None,
         Sensing::Continuous { .. } => {
             let quiet = BusCase { sensing: Sensing::Event, ..case.clone() };
-            Some(hint("sensing = \"event\", without changes".to_owned(), &quiet))
+            Some(hint("sensing = \"event\", quiet".to_owned(), &quiet))
         }
     }
 }
@@ -118,7 +118,7 @@ pub fn hints_for_other_answers(skin: &Skin, bus: usize, case: &BusCase) -> Vec<H
     let sums = |shared| case::sums_of_tree(skin, bus, case.period_ns, slot_us, shared);
     let torques = AnswerPlan::Torques { cells: case.answers.cells() };
     let others =
-        [(Some(torques), "torques"), (sums(true), "sums of all cells"), (sums(false), "sums of roots only")];
+        [(Some(torques), "torques"), (sums(true), "sums of all cells"), (sums(false), "sums, only of roots")];
     let other = |(answers, change): (Option<AnswerPlan>, &str)| {
         let other = BusCase { answers: answers?, ..case.clone() };
         (other.answers != case.answers).then(|| hint(change.to_owned(), &other))

@@ -43,7 +43,7 @@ impl Display for FitVerdict {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         match self {
             Self::Fits => f.pad("fits"),
-            Self::Nodes(nodes) => f.pad(&format!("in time, but too many nodes: {nodes}")),
+            Self::Nodes(nodes) => f.pad(&format!("in time, but {nodes} nodes")),
             Self::Bandwidth => f.pad("does not fit: bandwidth"),
             Self::Deadline => f.pad("does not fit: deadline"),
         }
@@ -195,7 +195,7 @@ mod tests {
         let run = "this run: 55.3 % of 1M/5M";
         for (late, cells, verdict) in [
             (0, 109, "fits"),
-            (0, 110, "in time, but too many nodes: 111"),
+            (0, 110, "in time, but 111 nodes"),
             (1, 109, "does not fit: deadline"),
             (1, 253, "does not fit: deadline"),
         ] {

@@ -20,7 +20,7 @@ pub struct Finding {
     /// Text shown if there is no requirement: the reference of the rating, such as `below the paper's value`, or the
     /// reason why it was not rated.
     pub against: Option<String>,
-    /// Where the requirement comes from: an option, the skin's file, a default.
+    /// Source of the requirement: an option, the skin's file, a default.
     pub origin: Option<String>,
     /// A command that shows the details.
     pub command: Option<String>,

@@ -117,7 +117,7 @@ pub(super) struct BusFigures {
     pub(super) joints: Option<(f64, f64, u64)>,
     /// Bit rates of the real bus for which the load is computed.
     pub(super) rates: ChosenRates,
-    /// Where the rates come from; `None` for defaults.
+    /// Source of the rates; `None` for defaults.
     pub(super) rates_from: Option<&'static str>,
     /// Time in s that the frames take on the real bus, by time of the run.
     pub(super) load: BinnedSums,
