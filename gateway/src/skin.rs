@@ -40,7 +40,7 @@ enum SkinSubcommand {
 
 /// Describe a skin of hexagonal cells on the arm of a UR5
 ///
-/// The same options give the same text, whose first line is the command that generates it.
+/// The text depends only on the options. Its first line is the command that generates it.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus skin generate -o skin.toml

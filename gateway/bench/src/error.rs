@@ -50,7 +50,7 @@ pub enum RunError {
     NoFlash(PathBuf),
     /// A scenario asks for a fault that only a simulated bus can make.
     #[error(
-        "the scenario's fault {kind:?} of {bus} at {at_s} s works only in virtual time; a run with processes supports \
+        "the fault {kind:?} of {bus} at {at_s} s works only in virtual time; a run with processes supports \
          kill, stop, continue, restart, link_down, link_up, stuck and drift"
     )]
     BusFault {

@@ -353,7 +353,10 @@ fn what_cannot_be_covered_is_refused_in_one_line() {
     let raised = CoverOptions { pitch, ..options() };
     assert!(Surface::new(0, &[single(cube(2.0))], &[], &raised).is_ok(), "{wide}");
     let infinite = link("l", vec![LinkMesh { scale: [1.0, f64::INFINITY, 1.0], ..LinkMesh::new(cube(1.0)) }]);
-    assert!(refused(infinite, options()).starts_with("link l, part 0: scale "));
+    assert_eq!(
+        refused(infinite, options()),
+        "link l, part 0: scale [1.0, inf, 1.0] and the pose give coordinates that are not finite; correct them"
+    );
     let overflowing = link("l", vec![LinkMesh { scale: [1e200; 3], ..LinkMesh::new(cube(1.0)) }]);
     assert!(refused(overflowing, options()).starts_with("link l: inf m²"));
     let pitch = refused(single(cube(1.0)), CoverOptions { pitch: 0.0, ..options() });

@@ -290,7 +290,7 @@ fn wrong_use_is_one_line_and_exit_code_2() {
     assert!(said.contains(", cells, "), "{said}");
     let skin = format!("{}/Cargo.toml", env!("CARGO_MANIFEST_DIR"));
     let said = refusal(&format!("dump {skin}"), 1);
-    assert!(said.contains("no frame in "), "{said}");
+    assert!(said.contains("Cargo.toml: no frame in "), "{said}");
 }
 
 #[test]
@@ -414,8 +414,7 @@ fn what_is_wrong_with_a_scenario_has_a_line_and_a_column() {
     let drop = "[[fault]]\nat_s = 1.0\nkind = \"drop\"\nprobability = 0.5\n";
     let refused = said(drop);
     assert!(
-        refused
-            .starts_with("skinbus: the scenario's fault \"drop\" of vcan0 at 1 s works only in virtual time"),
+        refused.starts_with("skinbus: the fault \"drop\" of vcan0 at 1 s works only in virtual time"),
         "{refused}"
     );
 }
@@ -427,7 +426,8 @@ fn times_are_taken_with_and_without_a_unit() {
     assert_ne!(shown("2ms"), shown("2s"));
     for wrong in ["10x", "s", "0s", "-1min"] {
         let said = refusal(&format!("run skin.toml --duration={wrong}"), 2);
-        assert!(said.contains("use a time above 0 s, up to 1e7 s, such as 10, 500ms, 90s"), "{said}");
+        let allowed = "use a time above 0 s, up to 1e7 s, such as 10, 500ms, 90s, 10min or 2h";
+        assert!(said.contains(allowed), "{said}");
     }
     let said = refusal("run nosuch.toml --duration 10s --record-split 1.5min --record x.mcap", 2);
     assert!(said.contains("nosuch.toml: No such file"), "both are taken: {said}");

@@ -81,7 +81,7 @@ fn a_fault_that_processes_cannot_make_is_refused() {
     ));
     let said = refusal(&place, "skinbus", "run skin.toml --scenario scenario.toml --bus-kind embedded", 2);
     assert!(
-        said.starts_with("skinbus: the scenario's fault \"drop\" of vcan0 at 1 s works only in virtual time"),
+        said.starts_with("skinbus: the fault \"drop\" of vcan0 at 1 s works only in virtual time"),
         "{said}"
     );
 }

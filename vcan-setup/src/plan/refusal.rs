@@ -72,7 +72,7 @@ pub enum PlanRefusal {
         /// The command that fixes it.
         command: String,
     },
-    /// The same name was given for both ends of a pair in one namespace.
+    /// Both ends of a pair in one namespace were given one name.
     #[error(
         "{0} cannot be both ends of a pair in one network namespace: give --peer another name, or --namespace"
     )]
