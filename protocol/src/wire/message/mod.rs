@@ -152,7 +152,7 @@ pub enum Message {
     },
     /// Measurements of a cell.
     Sensors {
-        /// The epoch of the last joints that the cell accepted.
+        /// The sender.
         from: CellId,
         /// The epoch of the last accepted joints.
         epoch: Epoch,
