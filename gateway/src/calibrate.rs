@@ -208,7 +208,7 @@ impl CalibrateCommand {
             "the robot will move for {seconds} s around its start pose, each joint by at most {within} rad or m"
         ));
         let summary =
-            run::run(&options, None).map_err(|error| Failure::with_code(error.exit_code(), error))?;
+            run::run(&options, Vec::new()).map_err(|error| Failure::with_code(error.exit_code(), error))?;
         let mut complaints = summary.end_messages(self.quiet);
         if summary.outcome != Outcome::Done {
             let last = complaints.pop().unwrap_or_else(|| "the run did not finish".to_owned());

@@ -1,5 +1,6 @@
 //! `skinbus run` and `skinbus demo`.
 
+mod controlled;
 mod show;
 
 use std::net::SocketAddr;
@@ -10,7 +11,7 @@ use std::time::Duration;
 use bench::emulate::EmulatedCells;
 use bench::processes::create_memory_file;
 use bench::record::{self, CandumpOutput};
-use bench::remote::JsonPipe;
+use bench::remote::Remote;
 use bench::run::{self, RunOptions};
 use bench::summary::Summary;
 use clap::Args;
@@ -38,7 +39,7 @@ use show::TableStyle;
 const DEMO_SKIN_TOML: &str = include_str!("../examples/ur5-253.toml");
 const DEMO_SCENARIO_TOML: &str = include_str!("../examples/demo.toml");
 
-/// Maximum duration in s of a run with `--view`.
+/// Maximum duration in s of a run with `--view` or `--control`.
 const MAX_VIEW_DURATION_S: f64 = 24.0 * 3600.0;
 
 /// Log of the demonstration's frames.
@@ -66,6 +67,10 @@ struct CommonOptions {
     /// Address of the page [default: any free port of this machine]
     #[arg(long, value_name = "ADDRESS:PORT", requires = "view")]
     listen: Option<SocketAddr>,
+    /// Read commands from standard input and write events to standard output, for a program that presses cells;
+    /// docs/reference/control.md describes them. The run ends at the end of the input, and without --duration only then
+    #[arg(long)]
+    control: bool,
     #[command(flatten)]
     recording: RecordingArguments,
 }
@@ -245,7 +250,7 @@ impl DemoCommand {
         options
             .announced
             .push(format!("to see the decoded frames: {place}skinbus dump vcan0 --bus-kind {kind}"));
-        let CommonOptions { recording, summary, verbose, view, listen, .. } = self.common;
+        let CommonOptions { recording, summary, verbose, view, listen, control, .. } = self.common;
         let numbered = self.candump.is_none();
         let path = self.candump.unwrap_or_else(|| DEMO_LOG.into());
         let candump = Some(CandumpOutput { path, numbered });
@@ -260,7 +265,8 @@ impl DemoCommand {
         };
         options.record = recording.options(candump, files, &[]);
         let page = view.then(|| PageProcess::start(&options, listen, &PageOptions::default())).transpose()?;
-        run_bench(&options, (summary.as_deref(), recording.overwrite), verbose, &[], page)
+        let remotes = RunRemotes { page, is_controlled: control };
+        run_bench(&options, (summary.as_deref(), recording.overwrite), verbose, &[], remotes)
     }
 }
 
@@ -296,7 +302,7 @@ impl RunCommand {
             print_note(format_args!("remark: {remark}"));
         }
         let mut options = self.common.options(skin_file, skin, scenario);
-        let CommonOptions { recording, summary, verbose, view, listen, .. } = self.common;
+        let CommonOptions { recording, summary, verbose, view, listen, control, .. } = self.common;
         options.kinds = self.kinds.kinds_of_buses(bus_names(&options.skin))?;
         let candump = self.candump.map(|path| CandumpOutput { path, numbered: false });
         let files = RunTexts { skin: skin_text, scenario: scenario_text, robot };
@@ -309,7 +315,8 @@ impl RunCommand {
         options.receive_buffer = bytes.unwrap_or(GATEWAY_RECEIVE_BUFFER_BYTES) as usize;
         options.cells_per_process = self.processes.cells_per_process.into();
         let page = view.then(|| PageProcess::start(&options, listen, &self.page)).transpose()?;
-        run_bench(&options, (summary.as_deref(), recording.overwrite), verbose, &read, page)
+        let remotes = RunRemotes { page, is_controlled: control };
+        run_bench(&options, (summary.as_deref(), recording.overwrite), verbose, &read, remotes)
     }
 }
 
@@ -336,7 +343,7 @@ fn emulated(
 impl CommonOptions {
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 1e13: checked")]
     fn options(&self, skin_file: PathBuf, skin: Skin, mut scenario: Scenario) -> RunOptions {
-        let until_stopped = self.view.then_some(MAX_VIEW_DURATION_S);
+        let until_stopped = (self.view || self.control).then_some(MAX_VIEW_DURATION_S);
         if let Some(seconds) = self.duration.or(until_stopped) {
             scenario.duration = Span((seconds * 1e6) as u64);
         }
@@ -359,12 +366,20 @@ impl CommonOptions {
     }
 }
 
+/// Programs that control a run.
+struct RunRemotes {
+    /// The page, if it is served.
+    page: Option<(PageProcess, Remote)>,
+    /// True to read commands from standard input.
+    is_controlled: bool,
+}
+
 fn run_bench(
     options: &RunOptions,
     (summary_file, overwrite): (Option<&Path>, OverwriteOption),
     is_verbose: bool,
     read: &[PathBuf],
-    page: Option<(PageProcess, JsonPipe)>,
+    remotes: RunRemotes,
 ) -> Result<(), Failure> {
     let written = [
         ("--candump", options.record.candump.as_ref().map(|candump| candump.path.as_path())),
@@ -372,14 +387,25 @@ fn run_bench(
         ("--summary", summary_file),
     ];
     check_distinct_files(written, read.iter().map(PathBuf::as_path))?;
+    let RunRemotes { page, is_controlled } = remotes;
+    if is_controlled {
+        controlled::check_standard_output(&written)?;
+    }
     // Create the file before the run, so that an error of the file is reported first.
     let summary = summary_file.map(|path| overwrite.create("--summary", path)).transpose()?;
+    let channel = is_controlled.then(|| controlled::start_channel(options)).transpose()?;
+    let (page, page_remote) = page.unzip();
+    let (channel, channel_remote) = channel.unzip();
+    let remotes = page_remote.into_iter().chain(channel_remote).collect();
     // The summary reports a panic too.
-    let (page, lines) = page.unzip();
-    let ended = panic::catch_unwind(AssertUnwindSafe(|| run::run(options, lines)));
+    let ended = panic::catch_unwind(AssertUnwindSafe(|| run::run(options, remotes)));
     drop(page);
     let (ended, panicked) = match ended {
-        Ok(ended) => (ended.map_err(|error| Failure::with_code(error.exit_code(), error))?, None),
+        Ok(Ok(ended)) => (ended, None),
+        Ok(Err(error)) => {
+            let failure = Failure::with_code(error.exit_code(), error);
+            return controlled::end_channel(channel, None, Err(failure));
+        }
         Err(panic) => {
             (Summary::for_failed_start(&options.skin, "the gateway panicked".to_owned()), Some(panic))
         }
@@ -390,20 +416,35 @@ fn run_bench(
             .err()
     });
     if let Some(panic) = panicked {
+        let failure = Failure::run_error("the gateway panicked");
+        let _ = controlled::end_channel(channel, Some(&ended), Err(failure));
         panic::resume_unwind(panic);
     }
-    let files = written.map(|(_, path)| path);
     let table =
         |is_coloured| show::format_summary(&ended, TableStyle { is_verbose, is_coloured, columns: None });
-    let printed = if ended.control.ticks > 0 { print_table(files, table) } else { Ok(()) };
+    let printed = if ended.control.ticks == 0 {
+        Ok(())
+    } else if is_controlled {
+        // Standard output has events only.
+        if is_verbose {
+            print_note(table(false).trim_end())
+        }
+        Ok(())
+    } else {
+        print_table(written.map(|(_, path)| path), table)
+    };
     // The failure prints the last line itself; each other message is one line.
     let mut lines = ended.end_messages(options.quiet);
     let lost: Vec<_> = unwritten.into_iter().chain(printed.err()).collect();
     let code = if lost.is_empty() { ended.outcome.exit_code() } else { 1 };
     lines.extend(lost.iter().map(ToString::to_string));
-    let Some(last) = lines.pop() else { return Ok(()) };
+    let last = lines.pop();
     for line in lines {
         print_note(format_args!("skinbus: {line}"));
     }
-    Err(Failure::with_code(code, last))
+    controlled::end_channel(
+        channel,
+        Some(&ended),
+        last.map_or(Ok(()), |last| Err(Failure::with_code(code, last))),
+    )
 }

@@ -12,7 +12,7 @@ use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command};
 
-use bench::remote::JsonPipe;
+use bench::remote::{JsonPipe, Remote};
 use bench::run;
 use clap::Args;
 use protocol::skin::Skin;
@@ -305,7 +305,7 @@ impl PageProcess {
         run: &run::RunOptions,
         listen: Option<SocketAddr>,
         options: &PageOptions,
-    ) -> Result<(Self, JsonPipe), Failure> {
+    ) -> Result<(Self, Remote), Failure> {
         let run::RunOptions { skin_file, skin, kinds, directory, .. } = run;
         let program = std::env::current_exe().map_err(|error| view_failure(&error))?;
         let mut command = Command::new(program);
@@ -338,7 +338,8 @@ impl PageProcess {
         command.process_group(0).stdin(OwnedFd::from(listener)).stdout(OwnedFd::from(there));
         let process = command.spawn().map_err(|error| view_failure(&error))?;
         print_address(Some(url));
-        Ok((Self { process, _address_file: address_file }, lines))
+        let remote = Remote { name: "view", lines, ends_run: false };
+        Ok((Self { process, _address_file: address_file }, remote))
     }
 }
 

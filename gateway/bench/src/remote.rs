@@ -50,6 +50,19 @@ pub enum BenchCommand {
         /// The bus.
         bus: usize,
     },
+    /// Ends the run in order, as at the end of its duration.
+    End,
+}
+
+/// Connection to a program that controls a run.
+#[derive(Debug)]
+pub struct Remote {
+    /// Name of the option that made the connection, without its dashes. Notes about commands begin with it.
+    pub name: &'static str,
+    /// Carries commands to the run, and its state back.
+    pub lines: JsonPipe,
+    /// True if the run ends when this connection ends.
+    pub ends_run: bool,
 }
 
 /// State of a bench that is under remote control.

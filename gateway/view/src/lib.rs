@@ -14,10 +14,14 @@
 //!
 //! A skin without buses is shown as a [`StaticSkinPage`]: one HTML file with the same scene, drawn by the same scripts.
 //!
+//! [`control`] is the same for programs: commands on standard input, events on standard output.
+//!
 //! [`live`], [`pressed`], [`scene`], [`still`], [`surface`], [`command`] and [`tape`] use neither sockets nor clocks.
 //! [`server`], [`serve`] and [`play`] do the input and output for them.
 
 pub mod command;
+pub mod control;
+mod followed;
 pub mod index;
 pub mod live;
 pub mod play;

@@ -1,6 +1,6 @@
 //! The state of a skin and its cells, computed from the frames on the buses.
 
-mod bus;
+pub(crate) mod bus;
 mod recent;
 mod said;
 
@@ -17,7 +17,7 @@ pub use self::said::{
     TorqueReply,
 };
 use crate::pressed::{CellKey, TouchRegistry};
-use protocol::message::SkinSensors;
+use protocol::message::{Message, SkinSensors};
 
 /// The state of a skin and its cells, as the frames on the buses show it.
 #[derive(Clone, Debug)]
@@ -78,7 +78,7 @@ impl LiveState {
     ) {
         for (index, frame) in latched {
             if let Some(bus) = self.buses.get_mut(index) {
-                bus.apply_frame(at, frame);
+                let _ = bus.apply_frame(at, frame);
                 self.recent.push(at, index, frame);
             }
         }
@@ -89,7 +89,7 @@ impl LiveState {
     pub fn apply_frame(&mut self, bus: usize, at: Micros, frame: &Frame) -> bool {
         self.began.get_or_insert(at);
         let Some(of) = self.buses.get_mut(bus) else { return false };
-        let joints = of.apply_frame(at, frame);
+        let joints = matches!(of.apply_frame(at, frame), Some(Message::Joints { .. }));
         self.recent.push(at, bus, frame);
         if joints {
             self.clock = Some(self.clock.map_or(bus, |clock| clock.min(bus)));
@@ -157,7 +157,7 @@ impl LiveState {
 
     /// Sets the time, by which cells become silent and loads are measured.
     pub fn handle_time(&mut self, now: Micros) {
-        self.buses.iter_mut().for_each(|bus| bus.handle_time(now));
+        self.buses.iter_mut().for_each(|bus| drop(bus.handle_time(now)));
     }
 
     /// Returns the bus index and node id of a cell if it may be pressed: it belongs to the skin and has reported test

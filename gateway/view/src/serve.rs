@@ -4,23 +4,21 @@ use std::collections::BTreeMap;
 use std::iter;
 use std::net::TcpListener;
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use bench::bus::follow::{BusSource, FollowStep, FollowedItem, Follower};
-use bench::bus::listen::{now, open_bus, send_message};
+use bench::bus::follow::FollowedItem;
 use bench::remote::{BenchState, JsonPipe};
-use protocol::bus::batch::MAX_BATCH_DATAGRAMS;
-use protocol::bus::{self, Bus, BusError, KindChoices};
-use protocol::can::Format;
+use protocol::bus::{BusError, KindChoices};
 use protocol::id::Node;
 use protocol::message::{Message, SensorPage, StimulusStart};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
 use crate::command::Command;
+use crate::followed::{BusOpener, FollowedBus, time_of_read_frames};
 use crate::live::{LiveState, StatusMessage};
 use crate::lock_ignoring_poison;
 use crate::player::PlayError;
@@ -33,13 +31,8 @@ use crate::surface::{RowMesh, pack_meshes};
 const SNAPSHOT_INTERVAL: Duration = Duration::from_millis(33);
 /// The number of snapshots between two status messages.
 const SNAPSHOTS_PER_STATUS: u64 = 6;
-/// The time for which a thread waits for frames before it checks whether it must stop.
-const RECEIVE_TIMEOUT: Duration = Duration::from_millis(50);
 /// The time for which a thread lets frames accumulate after the first one, so that it wakes up less often.
 const FRAME_GATHER_TIME: Duration = Duration::from_millis(8);
-
-/// The value of `read_to` while no frames wait to be read.
-const ALL_FRAMES_READ: u64 = u64::MAX;
 
 /// The skin to be shown, and the settings of the server.
 #[derive(Debug)]
@@ -79,17 +72,6 @@ pub enum ServeError {
     Server(std::io::Error),
 }
 
-/// The state that the thread of a bus shares with the main thread.
-#[derive(Debug)]
-struct SharedBus {
-    name: String,
-    format: Format,
-    bus: Mutex<Option<Arc<Bus>>>,
-    /// The time of the last frame that was read, in µs, while more frames wait to be read; otherwise
-    /// [`ALL_FRAMES_READ`].
-    read_to: AtomicU64,
-}
-
 /// Shows a skin until `stop` is set. Calls `is_served` once pages can connect.
 ///
 /// # Errors
@@ -103,25 +85,9 @@ pub fn serve(
     let ServeOptions { skin, surface, kinds, directory, listener, access, waits_for_buses: patient, bench } =
         options;
     let may_act = access.may_act;
-    let opened = |name: &str, format: Format| {
-        let options = bus::BusOptions {
-            own_frames: true,
-            directory: directory.clone(),
-            receive_buffer: 8 << 20,
-            ..bus::BusOptions::default()
-        };
-        open_bus(name, kinds.kind_of(name), Some(format), options).map(Arc::new)
-    };
-    let buses = skin.buses.iter().map(|bus| {
-        let first = match opened(&bus.name, bus.format) {
-            Ok(bus) => Some(bus),
-            Err(_) if patient => None,
-            Err(error) => return Err(ServeError::Bus(error)),
-        };
-        let read_to = AtomicU64::new(ALL_FRAMES_READ);
-        Ok(SharedBus { name: bus.name.clone(), format: bus.format, bus: Mutex::new(first), read_to })
-    });
-    let buses: Vec<_> = buses.collect::<Result<_, _>>()?;
+    let opener = BusOpener { kinds: &kinds, directory: directory.as_deref() };
+    let buses = skin.buses.iter().map(|bus| FollowedBus::open(bus, opener, patient));
+    let buses: Vec<_> = buses.collect::<Result<_, _>>().map_err(ServeError::Bus)?;
     let (shells, corners) = pack_meshes(&surface);
     let scene = Scene { shells, ..Scene::from_skin(&skin, may_act) };
     let scene = serde_json::to_string(&scene).unwrap_or_default();
@@ -129,9 +95,19 @@ pub fn serve(
     is_served();
     let live = Mutex::new(LiveState::new(skin));
     thread::scope(|scope| {
-        for (index, shared) in buses.iter().enumerate() {
-            let (live, opened) = (&live, &opened);
-            let receive = move || receive_frames(index, shared, live, stop, opened);
+        for (index, bus) in buses.iter().enumerate() {
+            let live = &live;
+            let receive = move || {
+                bus.receive(opener, FRAME_GATHER_TIME, stop, |follower| {
+                    let mut live = lock_ignoring_poison(live);
+                    follower.for_each_item(|item| {
+                        if let FollowedItem::Frame(received) = item {
+                            live.apply_frame(index, Micros(received.at_nanos / 1_000), &received.frame);
+                        }
+                    });
+                    live.set_bus_state(index, !follower.is_lost(), follower.dropped_frames());
+                });
+            };
             if let Err(error) = thread::Builder::new().spawn_scoped(scope, receive) {
                 stop.store(true, Ordering::Relaxed);
                 return Err(ServeError::Thread(error));
@@ -143,58 +119,10 @@ pub fn serve(
     Ok(server.counts())
 }
 
-/// A bus that is opened when it appears, and opened again after it was lost.
-struct ReopeningBus<'a, O> {
-    shared: &'a SharedBus,
-    opened: &'a O,
-    bus: Option<Arc<Bus>>,
-}
-
-impl<O: Fn(&str, Format) -> Result<Arc<Bus>, BusError>> BusSource for ReopeningBus<'_, O> {
-    fn bus(&self) -> Option<&Bus> {
-        self.bus.as_deref()
-    }
-
-    fn reopen(&mut self) -> Result<(), BusError> {
-        let bus = (self.opened)(&self.shared.name, self.shared.format)?;
-        self.bus = Some(Arc::clone(&bus));
-        *lock_ignoring_poison(&self.shared.bus) = Some(bus);
-        Ok(())
-    }
-}
-
-/// Receives frames on a bus until `stop` is set.
-fn receive_frames(
-    index: usize,
-    shared: &SharedBus,
-    live: &Mutex<LiveState>,
-    stop: &AtomicBool,
-    opened: &impl Fn(&str, Format) -> Result<Arc<Bus>, BusError>,
-) {
-    let mut source = ReopeningBus { shared, opened, bus: lock_ignoring_poison(&shared.bus).clone() };
-    let mut follower = Follower::new(None, FRAME_GATHER_TIME);
-    while !stop.load(Ordering::Relaxed) {
-        if let FollowStep::Gone(_) = follower.step(&mut source, RECEIVE_TIMEOUT) {
-            *lock_ignoring_poison(&shared.bus) = None;
-        }
-        // If the batch was full, more frames may be waiting to be read.
-        let last = follower.frames().last().filter(|_| follower.frames().len() == MAX_BATCH_DATAGRAMS);
-        let read_to = last.map_or(ALL_FRAMES_READ, |last| last.at_nanos / 1_000);
-        shared.read_to.store(read_to, Ordering::Relaxed);
-        let mut live = lock_ignoring_poison(live);
-        follower.for_each_item(|part| {
-            if let FollowedItem::Frame(received) = part {
-                live.apply_frame(index, Micros(received.at_nanos / 1_000), &received.frame);
-            }
-        });
-        live.set_bus_state(index, !follower.is_lost(), follower.dropped_frames());
-    }
-}
-
 /// Sends snapshots to the pages, and passes their commands to the buses and to the bench.
 fn publish_and_execute(
     live: &Mutex<LiveState>,
-    buses: &[SharedBus],
+    buses: &[FollowedBus],
     server: &Server,
     mut bench: Option<JsonPipe>,
     stop: &AtomicBool,
@@ -220,9 +148,7 @@ fn publish_and_execute(
             }
         }
         server.take_disconnected_pages().into_iter().for_each(|page| pressed.release(page));
-        // While frames wait to be read, time ends at the last frame that was read, so that no cell seems silent.
-        let read_to = buses.iter().map(|bus| Micros(bus.read_to.load(Ordering::Relaxed))).min();
-        let now = read_to.map_or_else(now, |read_to| now().min(read_to));
+        let now = time_of_read_frames(buses);
         let due = {
             let mut live = lock_ignoring_poison(live);
             live.handle_time(now);
@@ -248,10 +174,10 @@ fn publish_and_execute(
         };
         for ((bus, node), sensors) in due {
             let page = SensorPage::Skin(sensors);
-            send_or_lose(
-                buses.get(bus),
-                &Message::Stimulus { to: Node::Cell(node), from: StimulusStart::Next, page },
-            );
+            let message = Message::Stimulus { to: Node::Cell(node), from: StimulusStart::Next, page };
+            if let Some(bus) = buses.get(bus) {
+                bus.send_or_lose(&message);
+            }
         }
         next = (next + SNAPSHOT_INTERVAL).max(Instant::now());
         thread::sleep(next.saturating_duration_since(Instant::now()).max(Duration::from_millis(1)));
@@ -267,9 +193,9 @@ fn execute_command(
     command: &Command,
     live: &LiveState,
     pressed: &mut TouchRegistry,
-    buses: &[SharedBus],
+    buses: &[FollowedBus],
 ) {
-    let everywhere = |message: &Message| buses.iter().for_each(|bus| send_or_lose(Some(bus), message));
+    let everywhere = |message: &Message| buses.iter().for_each(|bus| bus.send_or_lose(message));
     match *command {
         Command::Press { bus, node, force_n } => match live.pressable_cell(bus, node) {
             Some(cell) => pressed.press(page, cell, force_n),
@@ -287,13 +213,5 @@ fn execute_command(
         | Command::Seek { .. }
         | Command::Step { .. }
         | Command::Jump { .. } => {}
-    }
-}
-
-/// Sends a message on a bus. A failure counts as a lost frame.
-fn send_or_lose(shared: Option<&SharedBus>, message: &Message) {
-    let bus = shared.and_then(|shared| Some((lock_ignoring_poison(&shared.bus).clone()?, shared.format)));
-    if let Some((bus, format)) = bus {
-        let _ = send_message(&bus, message, format);
     }
 }

@@ -43,6 +43,12 @@ impl Failure {
         Self { text: text.to_string(), code }
     }
 
+    /// Returns the exit code.
+    #[must_use]
+    pub const fn code(&self) -> u8 {
+        self.code
+    }
+
     /// Appends the text of a further error to the message.
     #[must_use]
     pub fn append(mut self, more: impl Display) -> Self {

@@ -98,8 +98,10 @@ pub(super) struct Bench<'a> {
     pub(super) recorder: Option<Recorder>,
     /// Queue of loop records to the recorder.
     pub(super) recorded: Option<rtrb::Producer<TimedRecord>>,
-    /// Remote control, if any.
-    pub(super) remote: Option<RemoteControl>,
+    /// Programs that control the run.
+    pub(super) remotes: Vec<RemoteControl>,
+    /// True if a command has ended the run.
+    pub(super) is_end_requested: bool,
     /// Buses that a command has taken down and that have not worked since.
     pub(super) commanded: SwitchedBuses,
     /// Processes of cells that have ended.

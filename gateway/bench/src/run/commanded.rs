@@ -1,5 +1,6 @@
 //! Commands to a run from another process: checked, carried out, noted, and answered with the state of the bench.
 
+use std::mem;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
@@ -24,44 +25,60 @@ const STATE_SEND_INTERVAL: Duration = Duration::from_millis(200);
 
 impl Bench<'_> {
     /// Carries out received commands, and sends the state if the interval is over. If the other side has ended, ends
-    /// the remote control and brings back the buses that it has taken down.
+    /// its remote control, and without any remote control brings back the buses that commands have taken down.
     pub(super) fn handle_remote_commands(&mut self, measured: &LoopTotals, progress: &Progress) {
         let links = &self.bus_links;
         self.commanded.forget_working_buses(|bus| {
             let link = &links.get(bus)?.link;
             (!link.is_gone()).then(|| link.state.commands.load(Ordering::Relaxed))
         });
-        let Some(mut remote) = self.remote.take() else { return };
-        if remote.lines.has_ended() {
+        for control in mem::take(&mut self.remotes) {
+            let kept = self.handle_remote(control, measured, progress);
+            self.remotes.extend(kept);
+        }
+        if self.remotes.is_empty() {
+            let links = &self.bus_links;
             self.commanded.release_down_buses(|bus| commands_sent(links, bus));
+        }
+    }
+
+    /// Carries out the commands of one remote control. Returns `None` if its other side has ended.
+    fn handle_remote(
+        &mut self,
+        mut control: RemoteControl,
+        measured: &LoopTotals,
+        progress: &Progress,
+    ) -> Option<RemoteControl> {
+        if control.remote.lines.has_ended() {
+            self.is_end_requested |= control.remote.ends_run;
             // At the end of the run the other side may end first.
-            if !self.signalled.load(Ordering::Relaxed) {
+            if !control.remote.ends_run && !self.signalled.load(Ordering::Relaxed) {
                 progress.print_error(
                     "--view: the process that served the page has ended; the run continues without the page",
                 );
             }
-            return;
+            return None;
         }
         for _ in 0..MAX_COMMANDS_PER_ROUND {
-            let Some(command) = remote.lines.receive() else { break };
+            let Some(command) = control.remote.lines.receive() else { break };
             let what = self.command_text(command);
             match self.execute_command(command) {
                 Ok(()) => {
-                    let note = format!("view: {what}");
+                    let note = format!("{}: {what}", control.remote.name);
                     progress.print_note(&note);
                     self.recorder.iter().for_each(|recorder| recorder.add_note(&note));
-                    remote.add_reply(true, what);
+                    control.add_reply(true, what);
                 }
-                Err(why) => remote.add_reply(false, format!("{what}: {why}")),
+                Err(why) => control.add_reply(false, format!("{what}: {why}")),
             }
         }
         let now = Instant::now();
-        if now >= remote.due {
-            remote.due = now + STATE_SEND_INTERVAL;
-            let state = self.bench_state(&remote, measured);
-            remote.lines.send(&state);
+        if now >= control.due {
+            control.due = now + STATE_SEND_INTERVAL;
+            let state = self.bench_state(&control, measured);
+            control.remote.lines.send(&state);
         }
-        self.remote = Some(remote);
+        Some(control)
     }
 
     /// Describes a command in words.
@@ -85,6 +102,7 @@ impl Bench<'_> {
                 )
             }
             BenchCommand::Bus { down, bus } => format!("bus {} {}", self.bus_name(bus), switched(down)),
+            BenchCommand::End => "end the run".to_owned(),
         }
     }
 
@@ -96,6 +114,10 @@ impl Bench<'_> {
                 self.commanded.check_switch(down, bus)?;
                 self.switch_bus(down, bus)?;
                 self.commanded.note_bus_switched(down, bus, commands_sent(&self.bus_links, bus));
+                Ok(())
+            }
+            BenchCommand::End => {
+                self.is_end_requested = true;
                 Ok(())
             }
         }
@@ -153,7 +175,7 @@ impl Bench<'_> {
         Ok(())
     }
 
-    fn bench_state(&self, remote: &RemoteControl, measured: &LoopTotals) -> BenchState {
+    fn bench_state(&self, control: &RemoteControl, measured: &LoopTotals) -> BenchState {
         let networks = self.bus_links.iter().enumerate();
         let networks = networks.filter_map(|(bus, bus_link)| Some((bus, bus_link.network.as_ref()?)));
         let links_down = networks.flat_map(|(bus, network)| {
@@ -170,7 +192,7 @@ impl Bench<'_> {
             buses: buses.collect(),
             lateness: measured.lateness,
             halted: measured.halts.present_halt_reason().map(str::to_owned),
-            answers: remote.answers.clone(),
+            answers: control.answers.clone(),
         }
     }
 }

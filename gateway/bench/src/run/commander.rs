@@ -7,7 +7,7 @@ use std::time::Instant;
 use thiserror::Error;
 
 use crate::processes::LaunchError;
-use crate::remote::{CommandReply, JsonPipe, Phase};
+use crate::remote::{CommandReply, Phase, Remote};
 
 /// Maximum number of kept replies.
 const MAX_REPLIES: usize = 8;
@@ -15,7 +15,7 @@ const MAX_REPLIES: usize = 8;
 /// The remote control of a run, with its latest replies to commands.
 #[derive(Debug)]
 pub(super) struct RemoteControl {
-    pub(super) lines: JsonPipe,
+    pub(super) remote: Remote,
     pub(super) answers: Vec<CommandReply>,
     /// Total number of replies so far.
     count: u64,
@@ -128,8 +128,13 @@ const fn phase_text(phase: Phase) -> &'static str {
 }
 
 impl RemoteControl {
-    pub(super) fn new(lines: JsonPipe) -> Self {
-        Self { lines, answers: Vec::new(), count: 0, due: Instant::now() }
+    pub(super) fn new(remote: Remote) -> Self {
+        Self { remote, answers: Vec::new(), count: 0, due: Instant::now() }
+    }
+
+    /// Sends the state in the next round.
+    pub(super) fn send_state_soon(&mut self) {
+        self.due = Instant::now();
     }
 
     pub(super) fn add_reply(&mut self, done: bool, text: String) {
@@ -138,7 +143,7 @@ impl RemoteControl {
             self.answers.remove(0);
         }
         self.answers.push(CommandReply { number: self.count, done, text });
-        self.due = Instant::now();
+        self.send_state_soon();
     }
 }
 

@@ -39,7 +39,7 @@ use self::commander::RemoteControl;
 pub use self::network::TreeTooDeep;
 use crate::emulate::EmulatedCells;
 pub use crate::error::RunError;
-use crate::remote::JsonPipe;
+use crate::remote::Remote;
 use crate::summary::Summary;
 use model::scenario::Scenario;
 
@@ -76,13 +76,13 @@ pub struct RunOptions {
     pub announced: Vec<String>,
 }
 
-/// Runs a bench to its end, or until SIGINT or SIGTERM. A failed run returns a summary too, with the reason. `remote`
-/// controls the bench while the loop runs.
+/// Runs a bench to its end, or until SIGINT or SIGTERM. A failed run returns a summary too, with the reason. Each of
+/// `remotes` controls the bench while the loop runs.
 ///
 /// # Errors
 /// Returns [`RunError`] if the run cannot start because of wrong use or configuration, after ending the cells and buses
 /// that it started.
-pub fn run(options: &RunOptions, remote: Option<JsonPipe>) -> Result<Summary, RunError> {
+pub fn run(options: &RunOptions, remotes: Vec<Remote>) -> Result<Summary, RunError> {
     let mut bench = match start::start(options) {
         Ok(bench) => bench,
         Err(error) if error.exit_code() == 1 => {
@@ -90,7 +90,7 @@ pub fn run(options: &RunOptions, remote: Option<JsonPipe>) -> Result<Summary, Ru
         }
         Err(error) => return Err(error),
     };
-    bench.remote = remote.map(RemoteControl::new);
+    bench.remotes = remotes.into_iter().map(RemoteControl::new).collect();
     match bench.bring_up_cells() {
         Ok(()) => {
             bench.print_announcements();

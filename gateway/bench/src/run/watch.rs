@@ -18,6 +18,7 @@ use super::accelerations::{Accelerations, TickMotion};
 use super::begin::{SWITCH_RETRY_INTERVAL, SentSwitchRequests};
 use super::bench::Bench;
 use super::commanded::start_bus_server;
+use super::commander::RemoteControl;
 use super::measured::LoopTotals;
 use super::receiver::BusEvent;
 use super::usage::{ProcessorTimes, private_memory_kib};
@@ -104,7 +105,7 @@ impl Bench<'_> {
             thread::sleep(MAIN_THREAD_INTERVAL);
             summary.interrupted = self.signalled.load(Ordering::Relaxed);
             failure = self.run_round(&mut script, &mut progress, measured, &mut inlet).err();
-            if failure.is_some() || summary.interrupted {
+            if failure.is_some() || summary.interrupted || self.is_end_requested {
                 self.shared.stop_loop.store(true, Ordering::Relaxed);
             }
             if failure.is_some() {
@@ -206,8 +207,12 @@ impl Bench<'_> {
                 });
                 let hint = format!("`skinbus frame resume --bus {bus} --bus-kind {kind}` resumes it");
                 progress.print_note(&format!("the robot is halted: {why}; {hint}"));
+                self.remotes.iter_mut().for_each(RemoteControl::send_state_soon);
             }
-            (true, None) => progress.print_note("the robot continues"),
+            (true, None) => {
+                progress.print_note("the robot continues");
+                self.remotes.iter_mut().for_each(RemoteControl::send_state_soon);
+            }
             (true, Some(_)) | (false, None) => {}
         }
         for line in self.recorder.iter().flat_map(Recorder::messages) {

@@ -4,7 +4,7 @@ use analysis::fit::rates::RequestedRates;
 use bench::view::CellView;
 use model::central::CentralComputation;
 use model::decode::wire_message;
-use model::table::{BusTable, CellState, CellStatus};
+use model::table::{BusTable, CellState, CellStatus, Notice};
 use protocol::can::Frame;
 use protocol::fixed::{Q1_14, TorqueFormat};
 use protocol::id::CellId;
@@ -22,9 +22,9 @@ const LOAD_WINDOW_US: u64 = 1_000_000;
 
 /// An epoch, and the joint positions that were broadcast in it.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct BroadcastJoints {
-    pub(super) epoch: Epoch,
-    pub(super) positions: [Q1_14; MAX_JOINTS],
+pub(crate) struct BroadcastJoints {
+    pub(crate) epoch: Epoch,
+    pub(crate) positions: [Q1_14; MAX_JOINTS],
 }
 
 /// The share of time for which frames occupy the real bus.
@@ -37,31 +37,31 @@ struct BusLoad {
 }
 
 #[derive(Clone, Debug)]
-pub(super) struct LiveBus {
-    pub(super) name: String,
-    pub(super) table: BusTable,
-    pub(super) central: CentralComputation,
-    pub(super) torque_format: TorqueFormat,
-    pub(super) sums: bool,
+pub(crate) struct LiveBus {
+    pub(crate) name: String,
+    pub(crate) table: BusTable,
+    pub(crate) central: CentralComputation,
+    pub(crate) torque_format: TorqueFormat,
+    pub(crate) sums: bool,
     /// The joint positions of the current epoch; `before` has those of the previous one.
-    pub(super) current: Option<BroadcastJoints>,
-    previous: Option<BroadcastJoints>,
+    pub(crate) current: Option<BroadcastJoints>,
+    pub(crate) previous: Option<BroadcastJoints>,
     /// The distributed and the central torque of each joint of the chain in the last completed epoch.
     torques: [(f64, f64); MAX_JOINTS],
     joints: usize,
     /// The last torque of each cell, by the cell's index on the bus.
-    pub(super) last: Vec<Option<(Epoch, Words)>>,
+    pub(crate) last: Vec<Option<(Epoch, Words)>>,
     /// For each cell, the time since which it is dead; `None` for a live cell.
-    pub(super) dead_since: Vec<Option<Micros>>,
+    pub(crate) dead_since: Vec<Option<Micros>>,
     rates: Option<BitRates>,
     load: BusLoad,
-    pub(super) halted: bool,
-    pub(super) is_up: bool,
-    pub(super) dropped: u64,
+    pub(crate) halted: bool,
+    pub(crate) is_up: bool,
+    pub(crate) dropped: u64,
 }
 
 impl LiveBus {
-    pub(super) fn new(skin: &Skin, bus: usize) -> Self {
+    pub(crate) fn new(skin: &Skin, bus: usize) -> Self {
         let mut table = BusTable::new(skin, bus);
         table.set_torque_comparison(true);
         let described = skin.buses.get(bus);
@@ -86,8 +86,8 @@ impl LiveBus {
         }
     }
 
-    /// Applies a frame. Returns true if it carries joints, which begin an epoch.
-    pub(super) fn apply_frame(&mut self, at: Micros, frame: &Frame) -> bool {
+    /// Applies a frame. Returns the message that it completes, if any; joints begin an epoch.
+    pub(crate) fn apply_frame(&mut self, at: Micros, frame: &Frame) -> Option<Message> {
         let received = self.table.read_frame(at, frame);
         let message = received.message().copied();
         if wire_message(frame).is_none() && !matches!(message, Some(Message::Stimulus { .. })) {
@@ -116,15 +116,15 @@ impl LiveBus {
         }
         // Joints begin an epoch, whichever node sent them.
         self.table.handle_read_frame(at, joints, &received, &mut |_| None);
-        joints
+        message
     }
 
-    pub(super) fn restart_counters(&mut self) {
+    pub(crate) fn restart_counters(&mut self) {
         self.table.reset_counts();
     }
 
     /// Returns the number of all losses so far, of any kind.
-    pub(super) fn loss_count(&self) -> u64 {
+    pub(crate) fn loss_count(&self) -> u64 {
         let (replies, uplink) = (self.table.reply_counts(), self.table.uplink());
         replies.late + replies.missing + uplink.lost + uplink.rejected + self.dropped
     }
@@ -143,9 +143,10 @@ impl LiveBus {
         }
     }
 
-    pub(super) fn handle_time(&mut self, now: Micros) {
+    /// Sets the time, by which cells become silent and the load is measured. Returns the notices since the last call.
+    pub(crate) fn handle_time(&mut self, now: Micros) -> Vec<Notice> {
         self.table.handle_time(now);
-        self.table.drain_notices().for_each(drop);
+        let notices = self.table.drain_notices().collect();
         for ((_, status), since) in self.table.statuses(now).zip(&mut self.dead_since) {
             match status {
                 CellStatus::Dead => _ = since.get_or_insert(now),
@@ -161,42 +162,43 @@ impl LiveBus {
             let share = self.load.busy_s / (passed as f64 * 1e-6);
             self.load = BusLoad { since: Some(now), busy_s: 0.0, share: Some(share) };
         }
+        notices
     }
 
-    pub(super) const fn set_state(&mut self, is_up: bool, dropped: u64) {
+    pub(crate) const fn set_state(&mut self, is_up: bool, dropped: u64) {
         (self.is_up, self.dropped) = (is_up, dropped);
     }
 
-    pub(super) const fn bus_load(&self) -> Option<f64> {
+    pub(crate) const fn bus_load(&self) -> Option<f64> {
         self.load.share
     }
 
-    pub(super) fn cell(&self, node: CellId) -> Option<&CellState> {
+    pub(crate) fn cell(&self, node: CellId) -> Option<&CellState> {
         self.table.cells().get(self.table.index_of(node)?)
     }
 
-    pub(super) fn sensors(&self, node: CellId, now: Micros) -> Option<SkinSensors> {
+    pub(crate) fn sensors(&self, node: CellId, now: Micros) -> Option<SkinSensors> {
         self.table.presumed_sensors(now).nth(self.table.index_of(node)?)?.0
     }
 
     /// Returns the distributed and the central torque of each joint of the chain.
-    pub(super) fn joint_torques(&self) -> impl Iterator<Item = (f64, f64)> {
+    pub(crate) fn joint_torques(&self) -> impl Iterator<Item = (f64, f64)> {
         self.torques.into_iter().take(self.joints)
     }
 
     /// Returns the position of a joint of the chain in rad or m; `None` before the first joints.
-    pub(super) fn joint_position(&self, joint: usize) -> Option<f64> {
+    pub(crate) fn joint_position(&self, joint: usize) -> Option<f64> {
         self.central.joint_positions(&self.current?.positions).get(joint).copied()
     }
 
     /// Returns the joint positions that were broadcast in one of the last two epochs; `None` for another epoch.
-    pub(super) fn joint_positions_in(&self, epoch: Epoch) -> Option<[Q1_14; MAX_JOINTS]> {
+    pub(crate) fn joint_positions_in(&self, epoch: Epoch) -> Option<[Q1_14; MAX_JOINTS]> {
         let both = [self.current, self.previous];
         both.into_iter().flatten().find(|heard| heard.epoch == epoch).map(|heard| heard.positions)
     }
 
     /// Encodes the state of each cell as a snapshot contains it.
-    pub(super) fn encode_cells(&self, now: Micros) -> Vec<[u8; 8]> {
+    pub(crate) fn encode_cells(&self, now: Micros) -> Vec<[u8; 8]> {
         let cells = self.table.cells().iter().zip(self.table.presumed_sensors(now)).enumerate();
         let bytes = cells.map(|(place, (cell, (sensors, status)))| {
             let view = CellView::new(cell, status);

@@ -1,0 +1,365 @@
+//! One bus of a controlled run: its cells, its epochs, and the presses on it.
+
+use model::table::{CellState, CellStatus, Notice};
+use protocol::can::Frame;
+use protocol::id::{CellId, Node};
+use protocol::message::{Message, NetworkPage, SkinSensors, State};
+use protocol::packet::{Epoch, Words, data_frame_id};
+use protocol::parameters::Baseline;
+use protocol::skin::Skin;
+use protocol::time::Micros;
+
+use super::event::{
+    CellChange, ControlEvent, JointTorques, ReportedBus, ReportedCell, RequestId, UnconfirmedReason,
+};
+use super::presses::{PendingPresses, Press, Unconfirmed};
+use crate::live::bus::{BroadcastJoints, LiveBus};
+
+/// The maximum error of a cell's J in steps of 2^-14, for a chain of six rows (requirement J-3).
+const MAX_J_ERROR_STEPS: f64 = 8.0;
+/// The number of rows from which on each row allows one step more.
+const ROWS_OF_MAX_J_ERROR: u8 = 6;
+
+/// One bus of a controlled run.
+#[derive(Debug)]
+pub(super) struct ControlBus {
+    live: LiveBus,
+    cells: Vec<ControlledCell>,
+    /// The number of joints on the bus, which is the number of the present epoch.
+    number: u64,
+    presses: PendingPresses,
+}
+
+/// A cell of a controlled run.
+#[derive(Clone, Copy, Debug)]
+struct ControlledCell {
+    node: CellId,
+    /// The maximum error of the cell's J.
+    j_error: f64,
+    subtracts_baseline: bool,
+    is_touched: bool,
+    last_packet: Micros,
+}
+
+impl ControlBus {
+    pub(super) fn new(skin: &Skin, bus: usize) -> Self {
+        let cells = skin.cells.iter().filter(|cell| cell.bus == bus).map(|cell| {
+            let further_rows = cell.row.saturating_sub(ROWS_OF_MAX_J_ERROR);
+            ControlledCell {
+                node: cell.node,
+                j_error: (MAX_J_ERROR_STEPS + f64::from(further_rows)) / 16_384.0,
+                subtracts_baseline: cell.baseline != Baseline::Off,
+                is_touched: false,
+                last_packet: Micros(0),
+            }
+        });
+        Self {
+            live: LiveBus::new(skin, bus),
+            cells: cells.collect(),
+            number: 0,
+            presses: PendingPresses::default(),
+        }
+    }
+
+    pub(super) fn name(&self) -> &str {
+        &self.live.name
+    }
+
+    /// Returns true if the cells answer with sums.
+    pub(super) const fn sums(&self) -> bool {
+        self.live.sums
+    }
+
+    /// Returns the number and the byte of the present epoch; `None` before the first joints.
+    pub(super) fn epoch(&self) -> Option<(u64, Epoch)> {
+        self.live.current.map(|current| (self.number, current.epoch))
+    }
+
+    /// Returns the byte of the epoch with this number.
+    pub(super) fn epoch_with_number(&self, number: u64) -> Epoch {
+        let present = self.epoch().map(|(_, epoch)| epoch).unwrap_or_default();
+        present.advanced_by(number.wrapping_sub(self.number).to_le_bytes()[0])
+    }
+
+    /// Returns true if joints and a heartbeat of each cell were received.
+    pub(super) fn is_complete(&self) -> bool {
+        self.number > 0 && self.live.table.cells().iter().all(|cell| cell.heartbeat().is_some())
+    }
+
+    /// Returns position, distributed torque and central torque of each joint of the chain.
+    pub(super) fn joint_values(&self) -> Vec<[f64; 3]> {
+        let torques = self.live.joint_torques().enumerate();
+        torques
+            .map(|(joint, (distributed, central))| {
+                [self.live.joint_position(joint).unwrap_or_default(), distributed, central]
+            })
+            .collect()
+    }
+
+    /// Handles a frame, and adds the events that it causes. Returns the held presses that are to be sent now.
+    pub(super) fn handle_frame(
+        &mut self,
+        at_ns: u64,
+        frame: &Frame,
+        every: u64,
+        events: &mut Vec<ControlEvent>,
+    ) -> Vec<Press> {
+        let at = Micros(at_ns / 1_000);
+        let message = self.live.apply_frame(at, frame);
+        if let Some(place) = data_frame_id(frame).ok().and_then(|id| self.live.table.index_of(id.sender()?))
+            && let Some(cell) = self.cells.get_mut(place)
+        {
+            cell.last_packet = at;
+        }
+        self.handle_notices(at, events);
+        match message {
+            Some(Message::Joints { .. }) => {
+                let ended = self.live.previous.filter(|_| every > 0 && self.number.is_multiple_of(every));
+                events.extend(ended.map(|ended| self.epoch_event(&ended, at_ns)));
+                self.number += 1;
+                return self.presses.begin_epoch(self.number, at);
+            }
+            Some(Message::Torque { from, epoch, torque }) => {
+                self.handle_torque(from, epoch, &torque, at_ns, events)
+            }
+            Some(Message::Network { from, epoch, page: NetworkPage::Heartbeat(beat) }) if self.live.sums => {
+                if let Node::Cell(cell) = from
+                    && let Some(place) = self.live.table.index_of(cell)
+                {
+                    self.set_touched(place, beat.state.has(State::ACTIVE), epoch, at_ns, events);
+                }
+            }
+            Some(_) | None => {}
+        }
+        Vec::new()
+    }
+
+    /// Returns the event of the epoch that the last joints have ended.
+    fn epoch_event(&self, ended: &BroadcastJoints, at_ns: u64) -> ControlEvent {
+        let positions = self.live.central.joint_positions(&ended.positions);
+        let mut joints = JointTorques::default();
+        for (position, (distributed, central)) in positions.into_iter().zip(self.live.joint_torques()) {
+            joints.positions.push(position);
+            joints.distributed.push(distributed);
+            joints.central.push(central);
+        }
+        let (bus, epoch) = (self.name().to_owned(), ended.epoch.0);
+        ControlEvent::Epoch { bus, epoch, number: self.number, at_ns, joints }
+    }
+
+    fn handle_torque(
+        &mut self,
+        from: CellId,
+        epoch: Epoch,
+        words: &Words,
+        at_ns: u64,
+        events: &mut Vec<ControlEvent>,
+    ) {
+        let Some(place) = self.live.table.index_of(from) else { return };
+        let is_zero = words.as_slice().iter().all(|&word| word == 0);
+        self.set_touched(place, !is_zero, epoch, at_ns, events);
+        let Some((present, present_epoch)) = self.epoch() else { return };
+        let Some(number) = present.checked_add_signed(epoch.epochs_since(present_epoch).into()) else {
+            return;
+        };
+        let Some(press) = self.presses.pending_in(from, number).cloned() else { return };
+        if press.hidden.is_some() {
+            return;
+        }
+        let Some(positions) = self.live.joint_positions_in(epoch) else { return };
+        let Some(cell) = self.cells.get(place) else { return };
+        let format = self.live.torque_format;
+        let central = &self.live.central;
+        let f_z = central.cell_force(place, &press.sensors);
+        let expected = central.cell_torque(place, &central.link_frames(&positions), f_z);
+        let tolerance = cell.j_error * f_z + format.step_size();
+        let is_near = |(&word, &expected): (&i16, &f64)| {
+            let is_saturated = word == i16::MAX || word == i16::MIN;
+            let limit = format.to_real(word);
+            // The true value of a saturated word lies beyond it.
+            (limit - expected).abs() <= tolerance || is_saturated && expected.abs() >= limit.abs() - tolerance
+        };
+        if !words.as_slice().iter().zip(&expected).all(is_near) {
+            return self.presses.note(from, press.first, UnconfirmedReason::OtherTorque);
+        }
+        if is_zero && f_z > 0.0 {
+            return self.presses.note(from, press.first, UnconfirmedReason::NoTorque);
+        }
+        self.presses.remove(from, press.first);
+        let joints = self.live.joint_torques().count();
+        events.push(ControlEvent::Confirmed {
+            id: press.id,
+            cell: self.cell_text(from),
+            force_n: press.force_n,
+            epoch: epoch.0,
+            at_ns,
+            torque: words.as_slice().iter().take(joints).map(|&word| format.to_real(word)).collect(),
+        });
+    }
+
+    fn set_touched(
+        &mut self,
+        place: usize,
+        touched: bool,
+        epoch: Epoch,
+        at_ns: u64,
+        events: &mut Vec<ControlEvent>,
+    ) {
+        let Some(cell) = self.cells.get_mut(place) else { return };
+        if std::mem::replace(&mut cell.is_touched, touched) != touched {
+            let cell = cell.node;
+            events.push(ControlEvent::Contact { cell: self.cell_text(cell), touched, epoch: epoch.0, at_ns });
+        }
+    }
+
+    fn handle_notices(&mut self, at: Micros, events: &mut Vec<ControlEvent>) {
+        let notices: Vec<_> = self.live.table.drain_notices().collect();
+        self.apply_notices(notices, at, events);
+    }
+
+    fn apply_notices(&mut self, notices: Vec<Notice>, at: Micros, events: &mut Vec<ControlEvent>) {
+        for notice in notices {
+            let (cell, state) = match notice {
+                Notice::Dead(cell) => (cell, CellChange::Dead),
+                Notice::Revived(cell) => (cell, CellChange::Alive),
+                Notice::Restarted(cell) => {
+                    self.presses.note_restart(cell, at);
+                    (cell, CellChange::Restarted)
+                }
+                Notice::Duplicate(_) | Notice::Returned(_) | Notice::OtherGateway => continue,
+            };
+            if state != CellChange::Alive
+                && let Some(cell) = self.live.table.index_of(cell).and_then(|place| self.cells.get_mut(place))
+            {
+                cell.is_touched = false;
+            }
+            events.push(ControlEvent::Cell { cell: self.cell_text(cell), state });
+        }
+    }
+
+    /// Handles the time: cells become silent, and presses expire.
+    pub(super) fn handle_time(&mut self, now: Micros, events: &mut Vec<ControlEvent>) {
+        let notices = self.live.handle_time(now);
+        self.apply_notices(notices, now, events);
+        let Self { live, cells, presses, .. } = self;
+        let statuses: Vec<_> = live.table.statuses(now).map(|(_, status)| status).collect();
+        let expired = presses.take_expired(now, |node| {
+            let place = live.table.index_of(node);
+            let cell = place.and_then(|place| live.table.cells().get(place));
+            let status = place.and_then(|place| statuses.get(place)).copied();
+            let is_ready = cell.is_some_and(CellState::is_ready);
+            let beat = cell.and_then(CellState::heartbeat);
+            // A heartbeat may be older than a resume: the table knows.
+            let is_halted = !is_ready && beat.is_some_and(|beat| beat.state.has(State::HALTED));
+            let reason = if matches!(status, Some(CellStatus::Dead | CellStatus::Unknown) | None) {
+                Some(UnconfirmedReason::Dead)
+            } else if live.halted || is_halted {
+                Some(UnconfirmedReason::Halted)
+            } else if !is_ready {
+                Some(UnconfirmedReason::NotReady)
+            } else if cell.and_then(CellState::is_measuring) == Some(true) {
+                Some(UnconfirmedReason::Measuring)
+            } else {
+                None
+            };
+            let last_packet = place.and_then(|place| cells.get(place)).map(|cell| cell.last_packet);
+            (reason, last_packet.unwrap_or_default())
+        });
+        expired.into_iter().for_each(|unconfirmed| events.push(self.unconfirmed_event(unconfirmed)));
+    }
+
+    /// Creates a press of a cell that asks for the next possible epoch.
+    pub(super) fn new_press(
+        &self,
+        id: Option<RequestId>,
+        cell: CellId,
+        (force_n, sensors): (f64, SkinSensors),
+        at: Micros,
+    ) -> Press {
+        let place = self.live.table.index_of(cell);
+        let hidden = if self.live.sums {
+            Some(UnconfirmedReason::Sums)
+        } else if place.is_some_and(|place| self.is_measuring(place)) {
+            Some(UnconfirmedReason::Measuring)
+        } else {
+            let force = place.map_or(0.0, |place| self.live.central.cell_force(place, &sensors));
+            (force_n > 0.0 && force <= 0.0).then_some(UnconfirmedReason::BelowThreshold)
+        };
+        Press { id, cell, force_n, sensors, first: self.presses.first_epoch(cell, self.number), at, hidden }
+    }
+
+    /// Adds a press. Returns it if its stimulus is to be sent now.
+    pub(super) fn add_press(&mut self, press: Press, events: &mut Vec<ControlEvent>) -> Option<Press> {
+        let mut replaced = None;
+        let sent = self.presses.add(press, self.number, |former| replaced = Some(former));
+        events.extend(replaced.map(|former| self.unconfirmed_event(former)));
+        sent
+    }
+
+    /// Removes all presses at the end of the run.
+    pub(super) fn end_presses(&mut self, events: &mut Vec<ControlEvent>) {
+        for unconfirmed in self.presses.take_all() {
+            events.push(self.unconfirmed_event(unconfirmed));
+        }
+    }
+
+    fn unconfirmed_event(&self, (press, reason): Unconfirmed) -> ControlEvent {
+        ControlEvent::Unconfirmed {
+            id: press.id,
+            cell: self.cell_text(press.cell),
+            force_n: press.force_n,
+            reason,
+            text: reason.text(),
+        }
+    }
+
+    fn is_measuring(&self, place: usize) -> bool {
+        let measures = self.live.table.cells().get(place).and_then(|cell| cell.is_measuring()) == Some(true);
+        measures || self.cells.get(place).is_some_and(|cell| cell.subtracts_baseline)
+    }
+
+    /// Returns the sensor words that a cell has latched, as far as the bus shows them.
+    pub(super) fn latched_sensors(&self, node: CellId, now: Micros) -> Option<SkinSensors> {
+        self.live.sensors(node, now)
+    }
+
+    /// Sets the state of the bus. Returns true if it was lost, or works again.
+    pub(super) fn set_state(&mut self, is_up: bool, dropped: u64) -> bool {
+        let was_up = self.live.is_up;
+        self.live.set_state(is_up, dropped);
+        was_up != is_up
+    }
+
+    pub(super) fn report(&self) -> ReportedBus {
+        ReportedBus {
+            bus: self.name().to_owned(),
+            up: self.live.is_up,
+            halted: self.live.halted,
+            epoch: self.epoch().map(|(_, epoch)| epoch.0),
+            number: self.number,
+            dropped_frames: self.live.dropped,
+        }
+    }
+
+    /// Returns the cells with a torque, or in a state that a user may not expect.
+    pub(super) fn reported_cells(&self, now: Micros) -> Vec<ReportedCell> {
+        let joints = self.live.joint_torques().count();
+        let format = self.live.torque_format;
+        let cells = self.live.table.statuses(now).zip(&self.live.last);
+        let cells = cells.filter(|((_, status), last)| *status != CellStatus::Quiet || last.is_some());
+        cells
+            .map(|((cell, status), last)| ReportedCell {
+                cell: self.cell_text(cell.node),
+                status: status.name(),
+                epoch: last.map(|(epoch, _)| epoch.0),
+                torque: last.map(|(_, words)| {
+                    words.as_slice().iter().take(joints).map(|&word| format.to_real(word)).collect()
+                }),
+            })
+            .collect()
+    }
+
+    fn cell_text(&self, node: CellId) -> String {
+        format!("{}:{node}", self.live.name)
+    }
+}

@@ -1,0 +1,355 @@
+//! Commands to a run: one JSON object a line.
+
+use std::io::{self, BufRead};
+
+use model::scenario::ProcessAction;
+use serde::{Deserialize, Deserializer, de};
+use serde_json::Value;
+
+use super::event::RequestId;
+use crate::pressed::MAX_FORCE_N;
+
+/// The maximum length of a line in bytes, without its end.
+pub const MAX_LINE_BYTES: usize = 4_096;
+/// The maximum length of a textual id in bytes.
+const MAX_ID_BYTES: usize = 64;
+
+/// A line of the input.
+#[derive(Clone, Debug, PartialEq)]
+pub enum InputLine {
+    /// A command.
+    Request(Request),
+    /// A line that is not a command.
+    Refused {
+        /// The id of the command, if it could be read.
+        id: Option<RequestId>,
+        /// The reason, in one line.
+        reason: String,
+    },
+}
+
+/// A command with its id.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Request {
+    /// The id that comes back in all events about the command.
+    pub id: Option<RequestId>,
+    /// The command.
+    pub command: ControlCommand,
+}
+
+/// A cell as a command names it: a node id as a number, or the text `NODE` or `BUS:NODE`.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct CellReference(pub String);
+
+/// A command to a run.
+#[derive(Clone, Debug, Deserialize, PartialEq)]
+#[serde(tag = "do", rename_all = "lowercase", deny_unknown_fields)]
+pub enum ControlCommand {
+    /// Presses a cell.
+    Press {
+        /// The cell.
+        cell: CellReference,
+        /// The force in N, 0 to [`MAX_FORCE_N`].
+        force_n: f64,
+    },
+    /// Releases a cell, or all cells that this program presses.
+    Release {
+        /// The cell; `None` for all.
+        #[serde(default)]
+        cell: Option<CellReference>,
+    },
+    /// Halts all cells.
+    Halt {},
+    /// Lets all halted cells continue.
+    Resume {},
+    /// Kills the process of a cell.
+    Kill {
+        /// The cell.
+        cell: CellReference,
+    },
+    /// Stops the process of a cell.
+    Stop {
+        /// The cell.
+        cell: CellReference,
+    },
+    /// Lets the stopped process of a cell continue.
+    Continue {
+        /// The cell.
+        cell: CellReference,
+    },
+    /// Starts the process of a cell again.
+    Restart {
+        /// The cell.
+        cell: CellReference,
+    },
+    /// Takes a bus down, or brings it up.
+    Bus {
+        /// The name of the bus.
+        bus: String,
+        /// True to take it down.
+        down: bool,
+    },
+    /// Takes the link between two cells down, or brings it up.
+    Link {
+        /// The two cells, of one bus.
+        cells: [CellReference; 2],
+        /// True to take it down.
+        down: bool,
+    },
+    /// Requests an event for every Nth epoch.
+    Epochs {
+        /// N; 0 ends the events.
+        every: u32,
+    },
+    /// Requests the state of the bench.
+    Report {},
+    /// Ends the run in order.
+    End {},
+}
+
+impl ControlCommand {
+    /// Returns the name of the command.
+    #[must_use]
+    pub const fn name(&self) -> &'static str {
+        match self {
+            Self::Press { .. } => "press",
+            Self::Release { .. } => "release",
+            Self::Halt {} => "halt",
+            Self::Resume {} => "resume",
+            Self::Kill { .. } => "kill",
+            Self::Stop { .. } => "stop",
+            Self::Continue { .. } => "continue",
+            Self::Restart { .. } => "restart",
+            Self::Bus { .. } => "bus",
+            Self::Link { .. } => "link",
+            Self::Epochs { .. } => "epochs",
+            Self::Report {} => "report",
+            Self::End {} => "end",
+        }
+    }
+
+    /// Returns the action on a cell's process, and the cell; `None` for other commands.
+    #[must_use]
+    pub const fn process_action(&self) -> Option<(ProcessAction, &CellReference)> {
+        match self {
+            Self::Kill { cell } => Some((ProcessAction::Kill, cell)),
+            Self::Stop { cell } => Some((ProcessAction::Stop, cell)),
+            Self::Continue { cell } => Some((ProcessAction::Continue, cell)),
+            Self::Restart { cell } => Some((ProcessAction::Restart, cell)),
+            _ => None,
+        }
+    }
+}
+
+impl<'de> Deserialize<'de> for CellReference {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        match Value::deserialize(deserializer)? {
+            Value::Number(number) => Ok(Self(number.to_string())),
+            Value::String(text) => Ok(Self(text)),
+            other => Err(de::Error::custom(format!("cell {other}: use a node id or \"BUS:NODE\""))),
+        }
+    }
+}
+
+impl InputLine {
+    /// Parses a line.
+    #[must_use]
+    pub fn parse(line: &[u8]) -> Self {
+        let refused = |id, reason: String| Self::Refused { id, reason };
+        if line.len() > MAX_LINE_BYTES {
+            return refused(None, too_long());
+        }
+        let mut object = match serde_json::from_slice(line) {
+            Ok(Value::Object(object)) => object,
+            Ok(_) => return refused(None, not_an_object("it is another JSON value")),
+            Err(error) => return refused(None, not_an_object(&error.to_string())),
+        };
+        let id = match object.remove("id").map(RequestId::try_from) {
+            None => None,
+            Some(Ok(id)) => Some(id),
+            Some(Err(reason)) => return refused(None, reason),
+        };
+        match serde_json::from_value(Value::Object(object)) {
+            Ok(ControlCommand::Press { force_n, .. }) if !(0.0..=MAX_FORCE_N).contains(&force_n) => {
+                refused(id, format!("force_n {force_n}: use 0 to {MAX_FORCE_N} N"))
+            }
+            Ok(command) => Self::Request(Request { id, command }),
+            Err(error) => refused(id, error.to_string()),
+        }
+    }
+}
+
+impl TryFrom<Value> for RequestId {
+    type Error = String;
+
+    fn try_from(value: Value) -> Result<Self, String> {
+        match value {
+            Value::Number(number) => Ok(Self::Number(number)),
+            Value::String(text) if text.len() <= MAX_ID_BYTES => Ok(Self::Text(text)),
+            other => Err(format!(
+                "id {}: use a number, or a text of at most {MAX_ID_BYTES} bytes",
+                kind_of(&other)
+            )),
+        }
+    }
+}
+
+const fn kind_of(value: &Value) -> &'static str {
+    match value {
+        Value::Null => "null",
+        Value::Bool(_) => "true or false",
+        Value::Number(_) => "number",
+        Value::String(_) => "text",
+        Value::Array(_) => "list",
+        Value::Object(_) => "object",
+    }
+}
+
+fn too_long() -> String {
+    format!("the line has more than {MAX_LINE_BYTES} bytes: send one command a line")
+}
+
+fn not_an_object(reason: &str) -> String {
+    format!("the line is not a command: {reason}; send one JSON object a line, such as {{\"do\":\"report\"}}")
+}
+
+/// Reads the next line, without its end. Returns `None` at the end of the input. Empty lines are skipped, and the rest
+/// of a line that is too long is discarded.
+///
+/// # Errors
+/// Returns [`io::Error`] if the input cannot be read.
+pub(super) fn read_line(input: &mut impl BufRead) -> io::Result<Option<InputLine>> {
+    loop {
+        let mut line = Vec::new();
+        let mut is_cut = false;
+        let ended = loop {
+            let available = match input.fill_buf() {
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+                available => available?,
+            };
+            if available.is_empty() {
+                break true;
+            }
+            let end = available.iter().position(|&byte| byte == b'\n');
+            let used = end.unwrap_or(available.len());
+            let room = (MAX_LINE_BYTES + 1).saturating_sub(line.len());
+            line.extend(available.iter().take(used.min(room)));
+            is_cut |= used > room;
+            input.consume(end.map_or(used, |end| end + 1));
+            if end.is_some() {
+                break false;
+            }
+        };
+        if is_cut {
+            return Ok(Some(InputLine::Refused { id: None, reason: too_long() }));
+        }
+        if !line.trim_ascii().is_empty() {
+            return Ok(Some(InputLine::parse(&line)));
+        }
+        if ended {
+            return Ok(None);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn command(text: &str) -> Option<ControlCommand> {
+        match InputLine::parse(text.as_bytes()) {
+            InputLine::Request(request) => Some(request.command),
+            InputLine::Refused { .. } => None,
+        }
+    }
+
+    fn reason(text: &str) -> String {
+        match InputLine::parse(text.as_bytes()) {
+            InputLine::Refused { reason, .. } => reason,
+            InputLine::Request(request) => panic!("{request:?}"),
+        }
+    }
+
+    #[test]
+    fn each_command_is_read_with_its_id() {
+        let cell = |text: &str| CellReference(text.to_owned());
+        let press = ControlCommand::Press { cell: cell("12"), force_n: 3.0 };
+        let with_id = InputLine::parse(br#"{"do":"press","id":7,"cell":12,"force_n":3}"#);
+        let id = Some(RequestId::Number(7.into()));
+        assert_eq!(with_id, InputLine::Request(Request { id, command: press }));
+        assert_eq!(
+            command(r#" {"force_n":0.5,"cell":"vcan0:3","do":"press","id":"a"} "#),
+            Some(ControlCommand::Press { cell: cell("vcan0:3"), force_n: 0.5 })
+        );
+        assert_eq!(command(r#"{"do":"release"}"#), Some(ControlCommand::Release { cell: None }));
+        assert_eq!(
+            command(r#"{"do":"link","cells":[3,"4"],"down":true}"#),
+            Some(ControlCommand::Link { cells: [cell("3"), cell("4")], down: true })
+        );
+        for name in ["halt", "resume", "report", "end"] {
+            let read = command(&format!(r#"{{"do":"{name}"}}"#)).unwrap();
+            assert_eq!(read.name(), name);
+        }
+        for name in ["kill", "stop", "continue", "restart"] {
+            let read = command(&format!(r#"{{"do":"{name}","cell":5}}"#)).unwrap();
+            assert_eq!((read.name(), read.process_action().unwrap().0.name()), (name, name));
+        }
+    }
+
+    #[test]
+    fn another_line_is_refused_with_the_reason_and_its_id() {
+        for (line, expected) in [
+            (
+                "x",
+                "the line is not a command: expected value at line 1 column 1; send one JSON object a line, such as \
+                   {\"do\":\"report\"}",
+            ),
+            (
+                "[]",
+                "the line is not a command: it is another JSON value; send one JSON object a line, such as \
+                    {\"do\":\"report\"}",
+            ),
+            ("{}", "missing field `do`"),
+            (
+                r#"{"do":"shoot"}"#,
+                "unknown variant `shoot`, expected one of `press`, `release`, `halt`, `resume`, \
+                                   `kill`, `stop`, `continue`, `restart`, `bus`, `link`, `epochs`, `report`, `end`",
+            ),
+            (r#"{"do":"halt","cell":1}"#, "unknown field `cell`, there are no fields"),
+            (r#"{"do":"press","cell":1}"#, "missing field `force_n`"),
+            (r#"{"do":"press","cell":[1],"force_n":1}"#, "cell [1]: use a node id or \"BUS:NODE\""),
+            (r#"{"do":"press","cell":1,"force_n":90.5}"#, "force_n 90.5: use 0 to 90 N"),
+            (r#"{"do":"press","cell":1,"force_n":-1}"#, "force_n -1: use 0 to 90 N"),
+            (r#"{"do":"halt","id":[]}"#, "id list: use a number, or a text of at most 64 bytes"),
+        ] {
+            assert_eq!(reason(line), expected, "{line}");
+        }
+        let refused = InputLine::parse(br#"{"do":"shoot","id":"x"}"#);
+        let InputLine::Refused { id, .. } = refused else { panic!("{refused:?}") };
+        assert_eq!(id, Some(RequestId::Text("x".to_owned())));
+    }
+
+    #[test]
+    fn lines_are_read_one_by_one_and_long_ones_are_discarded() {
+        let long = "x".repeat(3 * MAX_LINE_BYTES);
+        let text = format!("\n{{\"do\":\"halt\"}}\n{long}\n  \n{{\"do\":\"end\"}}");
+        for capacity in [1, 7, 8_192] {
+            let mut input = io::BufReader::with_capacity(capacity, text.as_bytes());
+            let read: Vec<_> = std::iter::from_fn(|| read_line(&mut input).unwrap()).collect();
+            let [first, second, third] = read.as_slice() else { panic!("{read:?}") };
+            assert!(matches!(first, InputLine::Request(Request { command: ControlCommand::Halt {}, .. })));
+            assert_eq!(*second, InputLine::Refused { id: None, reason: too_long() });
+            assert!(matches!(third, InputLine::Request(Request { command: ControlCommand::End {}, .. })));
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn any_bytes_are_read_without_a_panic(bytes: Vec<u8>) {
+            let _ = InputLine::parse(&bytes);
+            let mut input = bytes.as_slice();
+            while read_line(&mut input).unwrap().is_some() {}
+        }
+    }
+}

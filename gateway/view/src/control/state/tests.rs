@@ -1,0 +1,144 @@
+use super::*;
+use bench::remote::CommandReply;
+use model::testing::ONE_CELL_SKIN_TOML;
+use protocol::can::Format;
+use protocol::message::{Heartbeat, Joints, NetworkPage, State};
+use serde_json::{Value, json};
+
+/// A controlled run of one cell, whose bus the test plays.
+struct Played {
+    state: ControlState,
+    epoch: u8,
+}
+
+impl Played {
+    fn new() -> Self {
+        let skin = Skin::parse("skin.toml", ONE_CELL_SKIN_TOML).unwrap();
+        Self { state: ControlState::new(skin, "1.0", vec![("embedded", None)]), epoch: 0 }
+    }
+
+    /// A run that is ready, in its first epoch.
+    fn ready() -> Self {
+        let mut played = Self::new();
+        played.begin_epoch();
+        played.beat();
+        played.answer(&[]);
+        played.state.handle_time(played.now());
+        assert_eq!(played.events()[0]["event"], "ready");
+        played
+    }
+
+    fn now(&self) -> Micros {
+        Micros(u64::from(self.epoch) * 16_000)
+    }
+
+    fn receive(&mut self, message: &Message) {
+        for frame in message.encode().frames(Format::Fd) {
+            self.state.handle_frame(0, self.now().0 * 1_000, &frame);
+        }
+        self.state.handle_time(self.now());
+    }
+
+    fn begin_epoch(&mut self) {
+        self.epoch += 1;
+        let in_use = u8::try_from(self.state.skin.robot.joints.len()).unwrap();
+        let joints = Joints { positions: Default::default(), in_use };
+        self.receive(&Message::Joints { epoch: Epoch(self.epoch), joints });
+    }
+
+    fn beat(&mut self) {
+        let state = State(State::CONFIGURED.0 | State::TEST_MODE.0);
+        let page = NetworkPage::Heartbeat(Heartbeat { state, ..Heartbeat::default() });
+        let from = Node::Cell(CellId::new(1).unwrap());
+        self.receive(&Message::Network { from, epoch: Epoch(self.epoch), page });
+    }
+
+    fn line(&mut self, line: &Value) -> Vec<Value> {
+        self.state.handle_line(self.now(), InputLine::parse(line.to_string().as_bytes()));
+        self.events()
+    }
+
+    fn events(&mut self) -> Vec<Value> {
+        let events = self.state.output.events.drain(..);
+        events.map(|event| serde_json::to_value(event).unwrap()).collect()
+    }
+
+    fn answer(&mut self, answers: &[(u64, bool, &str)]) {
+        let reply =
+            |&(number, done, text): &(u64, bool, &str)| CommandReply { number, done, text: text.to_owned() };
+        let answers = answers.iter().map(reply).collect();
+        self.state.handle_bench_state(self.now(), BenchState { answers, ..BenchState::default() });
+    }
+}
+
+#[test]
+fn the_first_event_waits_for_the_loop_and_each_cell() {
+    let mut played = Played::new();
+    assert_eq!(played.line(&json!({"do": "report", "id": 1})).len(), 0);
+    played.begin_epoch();
+    played.answer(&[]);
+    played.state.handle_time(played.now());
+    assert_eq!(played.events().len(), 0);
+    played.beat();
+    let names: Vec<_> = played.events().iter().map(|event| event["event"].clone()).collect();
+    assert_eq!(names, ["ready", "report", "accepted"]);
+}
+
+#[test]
+fn commands_are_carried_out_in_their_order() {
+    let mut played = Played::ready();
+    for id in 1..=5 {
+        assert_eq!(played.line(&json!({"do": "kill", "cell": 1, "id": id})).len(), 0);
+    }
+    assert_eq!(played.state.output.commands.len(), MAX_COMMANDS_IN_FLIGHT);
+    assert_eq!(played.line(&json!({"do": "press", "cell": 1, "force_n": 3, "id": 6})).len(), 0);
+    played.answer(&[(1, true, "kill cell 1"), (2, false, "it has ended"), (3, false, "b"), (4, false, "c")]);
+    let answered = [
+        json!({"event": "accepted", "id": 1, "do": "kill", "text": "kill cell 1"}),
+        json!({"event": "error", "id": 2, "text": "it has ended"}),
+    ];
+    assert_eq!(played.events()[..2], answered);
+    assert_eq!(played.state.output.messages, [], "the fifth command is under way");
+    played.answer(&[(4, false, "c"), (5, false, "d")]);
+    let epoch = played.epoch + 2;
+    let expected = [
+        json!({"event": "error", "id": 5, "text": "d"}),
+        json!({"event": "accepted", "id": 6, "do": "press", "cell": "vcan0:1", "force_n": 3.0, "epoch": epoch}),
+    ];
+    assert_eq!(played.events(), expected);
+    let from = |message: &Message| match message {
+        Message::Stimulus { from, .. } => Some(*from),
+        _ => None,
+    };
+    let sent: Vec<_> =
+        played.state.output.messages.iter().map(|(bus, message)| (*bus, from(message))).collect();
+    assert_eq!(sent, [(0, Some(StimulusStart::Epoch(Epoch(epoch))))]);
+}
+
+#[test]
+fn commands_that_are_under_way_at_the_end_are_answered() {
+    let mut played = Played::ready();
+    played.line(&json!({"do": "press", "cell": 1, "force_n": 3, "id": 1}));
+    played.line(&json!({"do": "kill", "cell": 1, "id": 2}));
+    played.line(&json!({"do": "halt", "id": 3}));
+    played.state.handle_end([InputLine::parse(br#"{"do":"resume","id":4}"#)]);
+    let events: Vec<_> = played.events().iter().map(|it| (it["event"].clone(), it["id"].clone())).collect();
+    let expected = [("error", 2), ("error", 3), ("error", 4), ("unconfirmed", 1)];
+    assert_eq!(events, expected.map(|(event, id)| (json!(event), json!(id))));
+}
+
+#[test]
+fn the_end_of_the_input_ends_the_run_after_its_commands() {
+    let mut played = Played::ready();
+    played.line(&json!({"do": "kill", "cell": 1, "id": 1}));
+    played.state.handle_end_of_input(played.now());
+    assert!(matches!(
+        played.state.output.commands.as_slice(),
+        [BenchCommand::Process { .. }, BenchCommand::End]
+    ));
+    let refused = played.line(&json!({"do": "halt", "id": 2}));
+    assert_eq!(refused.len(), 0, "it waits for the answers");
+    played.answer(&[(1, true, "kill"), (2, true, "end the run")]);
+    let last = played.events().pop();
+    assert_eq!(last, Some(json!({"event": "error", "id": 2, "text": "the run is ending"})));
+}

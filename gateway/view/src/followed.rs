@@ -1,0 +1,135 @@
+//! The buses that a page or a control channel receives on: each is followed by a thread, and opened again after a loss.
+
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use bench::bus::follow::{BusSource, FollowStep, Follower};
+use bench::bus::listen::{now, open_bus, send_message};
+use protocol::bus::batch::MAX_BATCH_DATAGRAMS;
+use protocol::bus::{Bus, BusError, BusOptions, KindChoices};
+use protocol::can::Format;
+use protocol::message::Message;
+use protocol::skin::SkinBus;
+use protocol::time::Micros;
+
+use crate::lock_ignoring_poison;
+
+/// The time for which a thread waits for frames before it checks whether it must stop.
+const RECEIVE_TIMEOUT: Duration = Duration::from_millis(50);
+/// The size of the receive buffer of a bus in bytes.
+const RECEIVE_BUFFER_BYTES: usize = 8 << 20;
+/// The value of `read_to` while no frames wait to be read.
+const ALL_FRAMES_READ: u64 = u64::MAX;
+
+/// A bus that a thread follows, and on which other threads send.
+#[derive(Debug)]
+pub(crate) struct FollowedBus {
+    name: String,
+    format: Format,
+    bus: Mutex<Option<Arc<Bus>>>,
+    /// The time of the last frame that was read, in µs, while more frames wait to be read; otherwise
+    /// [`ALL_FRAMES_READ`].
+    read_to: AtomicU64,
+}
+
+/// Opens buses of a kind that the user chose.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct BusOpener<'a> {
+    /// The kind of each bus.
+    pub(crate) kinds: &'a KindChoices,
+    /// The directory of embedded buses; `None` for the default one.
+    pub(crate) directory: Option<&'a Path>,
+}
+
+impl BusOpener<'_> {
+    fn open(&self, name: &str, format: Format) -> Result<Arc<Bus>, BusError> {
+        let options = BusOptions {
+            own_frames: true,
+            directory: self.directory.map(Path::to_owned),
+            receive_buffer: RECEIVE_BUFFER_BYTES,
+            ..BusOptions::default()
+        };
+        open_bus(name, self.kinds.kind_of(name), Some(format), options).map(Arc::new)
+    }
+}
+
+/// A bus that is opened when it appears, and opened again after it was lost.
+struct ReopeningBus<'a> {
+    followed: &'a FollowedBus,
+    opener: BusOpener<'a>,
+    bus: Option<Arc<Bus>>,
+}
+
+impl BusSource for ReopeningBus<'_> {
+    fn bus(&self) -> Option<&Bus> {
+        self.bus.as_deref()
+    }
+
+    fn reopen(&mut self) -> Result<(), BusError> {
+        let bus = self.opener.open(&self.followed.name, self.followed.format)?;
+        self.bus = Some(Arc::clone(&bus));
+        *lock_ignoring_poison(&self.followed.bus) = Some(bus);
+        Ok(())
+    }
+}
+
+impl FollowedBus {
+    /// Opens a bus of the skin. If `waits` is set, a bus that does not open yet is opened later.
+    ///
+    /// # Errors
+    /// Returns [`BusError`] if the bus cannot be opened, unless `waits` is set.
+    pub(crate) fn open(described: &SkinBus, opener: BusOpener<'_>, waits: bool) -> Result<Self, BusError> {
+        let bus = match opener.open(&described.name, described.format) {
+            Ok(bus) => Some(bus),
+            Err(_) if waits => None,
+            Err(error) => return Err(error),
+        };
+        Ok(Self {
+            name: described.name.clone(),
+            format: described.format,
+            bus: Mutex::new(bus),
+            read_to: AtomicU64::new(ALL_FRAMES_READ),
+        })
+    }
+
+    /// Receives frames until `stop` is set, and passes the follower to `apply` after each step. After some frames have
+    /// arrived, waits for `gather`, so that one step reads many.
+    pub(crate) fn receive(
+        &self,
+        opener: BusOpener<'_>,
+        gather: Duration,
+        stop: &AtomicBool,
+        mut apply: impl FnMut(&mut Follower),
+    ) {
+        let mut source =
+            ReopeningBus { followed: self, opener, bus: lock_ignoring_poison(&self.bus).clone() };
+        let mut follower = Follower::new(None, gather);
+        while !stop.load(Ordering::Relaxed) {
+            if let FollowStep::Gone(_) = follower.step(&mut source, RECEIVE_TIMEOUT) {
+                *lock_ignoring_poison(&self.bus) = None;
+            }
+            // If the batch was full, more frames may be waiting to be read.
+            let last = follower.frames().last().filter(|_| follower.frames().len() == MAX_BATCH_DATAGRAMS);
+            let read_to = last.map_or(ALL_FRAMES_READ, |last| last.at_nanos / 1_000);
+            self.read_to.store(read_to, Ordering::Relaxed);
+            apply(&mut follower);
+        }
+    }
+
+    /// Sends a message. A failure counts as a lost frame.
+    pub(crate) fn send_or_lose(&self, message: &Message) {
+        let bus = lock_ignoring_poison(&self.bus).clone();
+        if let Some(bus) = bus {
+            let _ = send_message(&bus, message, self.format);
+        }
+    }
+}
+
+/// Returns the present time. While frames wait to be read, time ends at the last frame that was read, so that no cell
+/// seems silent.
+pub(crate) fn time_of_read_frames(buses: &[FollowedBus]) -> Micros {
+    let read_to = buses.iter().map(|bus| Micros(bus.read_to.load(Ordering::Relaxed))).min();
+    read_to.map_or_else(now, |read_to| now().min(read_to))
+}
