@@ -17,6 +17,7 @@
 
 pub mod browser;
 pub mod buses;
+pub mod controlled;
 pub mod external;
 pub mod log;
 pub mod page;

@@ -8,6 +8,7 @@ mod process_captures;
 mod process_chains;
 mod process_commission;
 mod process_conformance;
+mod process_control;
 mod process_end;
 mod process_experiment;
 mod process_external;
