@@ -12,7 +12,9 @@ use crate::container::{self, read_uninterrupted};
 /// The number of bytes at a file's beginning within which the header record of a recording must end.
 const HEADER_SEARCH_BYTES: usize = 4 << 10;
 const UNPACK_ADVICE: &str = "unpack it first";
-const EXPORT_ADVICE: &str = "write a candump log with `can_logconvert FILE NEW.log` (pip install python-can)";
+const EXPORT_ADVICE: &str = "convert it to a recording with `can_logconvert FILE NEW.mcap` (pip install the Python \
+                             package in gateway/python), or to a candump log with `can_logconvert FILE NEW.log` (pip \
+                             install python-can)";
 
 /// The first bytes of known formats. Everything else is treated as text.
 const MAGIC: &[(&[u8], InputFormat)] = &[
@@ -67,7 +69,8 @@ const MAGIC: &[(&[u8], InputFormat)] = &[
 
 const MDF: InputFormat = InputFormat::Other(
     "an MDF file",
-    "write a candump log with `can_logconvert FILE NEW.log` (pip install python-can[mf4])",
+    "convert it to a recording with `can_logconvert FILE NEW.mcap` (pip install the Python package in gateway/python \
+     and python-can[mf4]), or to a candump log with `can_logconvert FILE NEW.log` (pip install python-can[mf4])",
 );
 const TRC: InputFormat = InputFormat::Other("a PEAK trace", EXPORT_ADVICE);
 const CSV: InputFormat = InputFormat::Other(
