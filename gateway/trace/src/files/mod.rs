@@ -13,14 +13,14 @@ use std::sync::atomic::AtomicBool;
 
 pub use log::LogFile;
 pub use protocol::input::parent_folder;
-use target::{OutputTarget, open_stream, temporary_name, with_exists_hint};
+use target::{OutputTarget, open_stream, with_exists_hint};
 pub use target::{
     STANDARD_OUTPUT, check_writable, check_writable_regular_file, path_with_suffix, rename, sync_folder,
     with_creation_hint,
 };
 pub(crate) use target::{
-    create_unnamed_file, device_and_inode, lock_exclusively, name_unnamed_file, open_no_follow,
-    still_names_file, write_with_retries,
+    create_unnamed_file, device_and_inode, exists_error, lock_exclusively, name_unnamed_file, open_no_follow,
+    still_names_file, temporary_name, write_with_retries,
 };
 
 /// A file that gets its name only when it is complete. Until then it is unnamed, and so disappears if the program is

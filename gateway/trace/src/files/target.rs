@@ -93,7 +93,7 @@ fn not_regular_file_error() -> io::Error {
 }
 
 /// Returns the error for an output file that exists already.
-pub(super) fn exists_error() -> io::Error {
+pub(crate) fn exists_error() -> io::Error {
     let why = "it exists: name another file, or overwrite it with --overwrite";
     io::Error::new(io::ErrorKind::AlreadyExists, why)
 }
@@ -250,7 +250,7 @@ pub(crate) fn write_all_with_retries(file: &mut impl Write, mut bytes: &[u8]) ->
 }
 
 /// Returns a temporary name in the folder of a file. The name contains the process id, so no other program uses it.
-pub(super) fn temporary_name(path: &Path) -> PathBuf {
+pub(crate) fn temporary_name(path: &Path) -> PathBuf {
     let mut name = OsString::from(".");
     name.push(path.file_name().unwrap_or_default());
     name.push(format!(".{}.part", std::process::id()));

@@ -1,0 +1,173 @@
+//! The folder of the columns, which gets its name when it is complete.
+
+use std::fs::{self, File};
+use std::io::{self, Read, Write};
+use std::path::{Path, PathBuf};
+
+use rustix::fs::{CWD, RenameFlags, renameat_with};
+
+use super::npy::{Element, NpyFile};
+use crate::files::{
+    create_unnamed_file, exists_error, rename, sync_folder, temporary_name, with_creation_hint,
+};
+
+/// The name of the file that describes the columns. A folder with it is one of columns.
+pub const DESCRIPTION_FILE: &str = "columns.json";
+/// The first key of the description, with the version of the format as its value.
+pub const FORMAT_KEY: &str = "skinbus_columns";
+/// The version of the format.
+pub const FORMAT_VERSION: u32 = 1;
+/// Number of bytes at the beginning of a description that contain the first key.
+const MARKER_BYTES: u64 = 64;
+
+/// A folder that gets its name only when all its files are complete. Until then it is called `.NAME.PID.part`, and is
+/// removed if the program fails.
+#[derive(Debug)]
+pub struct ColumnFolder {
+    path: PathBuf,
+    overwrite: bool,
+    /// The folder as long as it has its temporary name.
+    part: Option<PathBuf>,
+}
+
+impl ColumnFolder {
+    /// Creates the folder under its temporary name. An existing folder of columns is replaced at the end if `overwrite`
+    /// is true, and is an error otherwise.
+    ///
+    /// # Errors
+    /// Returns an error, with advice to the user, if the folder cannot be created or its name is taken.
+    pub fn create(path: &Path, overwrite: bool) -> io::Result<Self> {
+        check_columns_writable(path, overwrite)?;
+        let part = temporary_name(path);
+        fs::create_dir(&part).map_err(with_creation_hint)?;
+        Ok(Self { path: path.to_owned(), overwrite, part: Some(part) })
+    }
+
+    /// Creates the file of a column.
+    ///
+    /// # Errors
+    /// Returns an error if the file cannot be created.
+    pub fn create_column(
+        &self,
+        table: &str,
+        column: &str,
+        element: Element,
+        width: Option<usize>,
+    ) -> io::Result<NpyFile> {
+        NpyFile::create(&self.place().join(format!("{table}.{column}.npy")), element, width)
+    }
+
+    /// Creates a file for reading and writing that disappears when it is closed.
+    ///
+    /// # Errors
+    /// Returns an error if the file cannot be created.
+    pub fn create_temporary_file(&self) -> io::Result<File> {
+        create_unnamed_file(self.place(), 0o600).or_else(|_| {
+            // The file system has no unnamed files: the name is removed while the file is open.
+            let name = self.place().join(".blocks");
+            let file = File::options().read(true).write(true).create_new(true).open(&name)?;
+            fs::remove_file(name)?;
+            Ok(file)
+        })
+    }
+
+    /// Writes the description, which must begin with [`FORMAT_KEY`], and gives the folder its name.
+    ///
+    /// # Errors
+    /// Returns an error if the file system refuses, or if another program has created the name meanwhile.
+    pub fn finish(mut self, description: &str) -> io::Result<()> {
+        let Some(part) = self.part.clone() else { return Ok(()) };
+        let mut file = File::create_new(part.join(DESCRIPTION_FILE))?;
+        file.write_all(description.as_bytes())?;
+        file.sync_all()?;
+        File::open(&part)?.sync_all()?;
+        if self.overwrite && self.path.exists() {
+            check_columns_writable(&self.path, true)?;
+            // Both names exist at every time, so another program never finds none.
+            match renameat_with(CWD, &part, CWD, &self.path, RenameFlags::EXCHANGE) {
+                Ok(()) => remove_columns(&part),
+                Err(_) => {
+                    remove_columns(&self.path);
+                    rename(&part, &self.path, false)?;
+                }
+            }
+        } else {
+            rename(&part, &self.path, false)?;
+        }
+        self.part = None;
+        sync_folder(&self.path);
+        Ok(())
+    }
+
+    fn place(&self) -> &Path {
+        self.part.as_deref().unwrap_or(&self.path)
+    }
+}
+
+impl Drop for ColumnFolder {
+    fn drop(&mut self) {
+        if let Some(part) = &self.part {
+            remove_columns(part);
+        }
+    }
+}
+
+/// Checks that a folder of columns may be written, before there is anything to write.
+///
+/// # Errors
+/// Returns an error, with advice to the user, if it may not.
+pub fn check_columns_writable(path: &Path, overwrite: bool) -> io::Result<()> {
+    let kind = match fs::symlink_metadata(path) {
+        Ok(about) => about.file_type(),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => {
+            let parent = crate::files::parent_folder(path);
+            return fs::metadata(parent).map(|_| ()).map_err(with_creation_hint);
+        }
+        Err(error) => return Err(with_creation_hint(error)),
+    };
+    let refused = |why: String| Err(io::Error::new(io::ErrorKind::AlreadyExists, why));
+    if !kind.is_dir() {
+        return refused("it is not a folder of columns: name another one".to_owned());
+    }
+    if !has_description(path) {
+        return refused("it is a folder of other files: name another one".to_owned());
+    }
+    if !overwrite {
+        return Err(exists_error());
+    }
+    for entry in fs::read_dir(path)? {
+        let name = entry?.file_name();
+        if !is_column_file(Path::new(&name)) {
+            return refused(format!(
+                "it contains {}, which is not one of its columns: move that away, or name another folder",
+                name.display()
+            ));
+        }
+    }
+    Ok(())
+}
+
+/// Returns true for a folder with the description of columns, of any version.
+fn has_description(path: &Path) -> bool {
+    let mut head = String::new();
+    let read = File::open(path.join(DESCRIPTION_FILE))
+        .and_then(|file| file.take(MARKER_BYTES).read_to_string(&mut head));
+    read.is_ok() && head.trim_start_matches(['{', ' ', '\n']).starts_with(&format!("\"{FORMAT_KEY}\""))
+}
+
+fn is_column_file(name: &Path) -> bool {
+    name == Path::new(DESCRIPTION_FILE) || name.extension().is_some_and(|end| end == "npy")
+}
+
+/// Removes the columns of a folder, and the folder if nothing else is in it. Errors cannot be handled here.
+fn remove_columns(path: &Path) {
+    for entry in fs::read_dir(path).into_iter().flatten().flatten() {
+        if is_column_file(Path::new(&entry.file_name())) {
+            let _ = fs::remove_file(entry.path());
+        }
+    }
+    let _ = fs::remove_dir(path);
+}
+
+#[cfg(test)]
+mod tests;
