@@ -25,6 +25,7 @@ pub use row::{MAX_JACOBIAN_ERROR_STEPS, TorqueRow, WordVerdict};
 pub use watch::JointsWatcher;
 
 use protocol::fixed::{Q, is_saturated};
+use protocol::id::CellId;
 use protocol::message::{SkinSensors, State};
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Cell, MAX_ROBOT_JOINTS, Skin, SkinReply};
@@ -149,21 +150,52 @@ pub fn explain(skin: &Skin, moments: &[Option<ObservedJoints>]) -> TorqueExplana
 #[derive(Debug)]
 pub struct Explainer<'a> {
     skin: &'a Skin,
-    /// For each bus, the skin reduced to that bus, and two central computations: with the cells' words, and with the
-    /// file's numbers.
-    buses: Vec<(Skin, [CentralComputation; 2])>,
+    buses: Vec<BusOfSkin>,
+}
+
+/// The data of one bus of a skin.
+#[derive(Debug)]
+struct BusOfSkin {
+    /// The skin reduced to the bus.
+    part: Skin,
+    /// Two central computations: with the cells' words, and with the file's numbers.
+    central: [CentralComputation; 2],
+    /// The cells by node id.
+    cells: Vec<CellOfBus>,
+}
+
+/// The data of one cell of a bus.
+#[derive(Clone, Copy, Debug)]
+struct CellOfBus {
+    /// Index of the cell in the part of the skin.
+    place: usize,
+    /// Hash of the configuration that the skin gives to the cell.
+    hash: u16,
+    /// Maximum error of J in the cell, in steps.
+    max_error_steps: i64,
+}
+
+impl BusOfSkin {
+    fn new(skin: &Skin, bus: usize) -> Self {
+        let part = skin.with_cells_of_bus(bus);
+        let central = [CentralComputation::new(&part), CentralComputation::without_quantisation(&part)];
+        let mut cells: Vec<_> = part.cells.iter().enumerate().collect();
+        cells.sort_unstable_by_key(|(_, cell)| cell.node);
+        let cells = cells.into_iter().map(|(place, cell)| {
+            let parameters = part.parameters(cell);
+            let max_error_steps = max_jacobian_error_steps(parameters.rows_to_cell().len());
+            CellOfBus { place, hash: parameters.hash(), max_error_steps }
+        });
+        let cells = cells.collect();
+        Self { part, central, cells }
+    }
 }
 
 impl<'a> Explainer<'a> {
     /// Prepares the central computation of a skin, from which torques are explained.
     #[must_use]
     pub fn new(skin: &'a Skin) -> Self {
-        let parts = (0..skin.buses.len()).map(|bus| {
-            let part = skin.with_cells_of_bus(bus);
-            let both = [CentralComputation::new(&part), CentralComputation::without_quantisation(&part)];
-            (part, both)
-        });
-        Self { skin, buses: parts.collect() }
+        Self { skin, buses: (0..skin.buses.len()).map(|bus| BusOfSkin::new(skin, bus)).collect() }
     }
 
     /// Derives the torques for these joints; `moments` has the joints and answers of each bus of the skin, `None` if
@@ -176,13 +208,14 @@ impl<'a> Explainer<'a> {
 
 fn explain_torques_of_parts(
     skin: &Skin,
-    parts: &[(Skin, [CentralComputation; 2])],
+    parts: &[BusOfSkin],
     moments: &[Option<ObservedJoints>],
 ) -> TorqueExplanation {
     let mut explanation =
         TorqueExplanation { buses: Vec::new(), cells: Vec::new(), total: Vec::new(), missing: Vec::new() };
     let mut sums = [JointTorqueSum::default(); MAX_ROBOT_JOINTS];
-    for (index, ((bus, (part, both)), moment)) in skin.buses.iter().zip(parts).zip(moments).enumerate() {
+    for (index, ((bus, of_bus), moment)) in skin.buses.iter().zip(parts).zip(moments).enumerate() {
+        let BusOfSkin { part, central: both, cells } = of_bus;
         let name = &bus.name;
         let Some(moment) = moment else {
             if skin.cells_on_bus(index).next().is_some() {
@@ -212,11 +245,10 @@ fn explain_torques_of_parts(
             halted: moment.halted,
         });
         let mut silent = 0;
-        let mut here: Vec<_> = part.cells.iter().enumerate().collect();
-        here.sort_unstable_by_key(|(_, cell)| cell.node);
-        for (place, cell) in here {
+        for &CellOfBus { place, hash, max_error_steps } in cells {
+            let Some(cell) = part.cells.get(place) else { continue };
             let Some(said) = moment.cells.get(cell.node.index()) else { continue };
-            let known = usable_contact(skin, name, cell, said, &mut explanation.missing);
+            let known = usable_contact(name, cell.node, hash, said, &mut explanation.missing);
             let force = known.map(|(sensors, origin)| force_steps_of(cell, &sensors, origin));
             let active = force.is_some_and(|force| force.force_steps > 0);
             if said.answer.is_none() && force.is_none() {
@@ -242,10 +274,9 @@ fn explain_torques_of_parts(
             let unrounded = in_numbers.cell_torque(place, real, newtons);
             let words = said.answer.map(|(_, words)| words);
             let format = bus.torque_format;
-            let steps = max_jacobian_error_steps(part.parameters(cell).rows_to_cell().len());
             let rows = chain.iter().enumerate().map(|(at, joint)| {
                 let moves = at < usize::from(cell.joint);
-                let steps = moves.then_some(steps);
+                let steps = moves.then_some(max_error_steps);
                 torque_row(joint, at, steps, force.as_ref(), &exact, &unit, format, words.as_ref())
             });
             let rows: Vec<_> = rows.collect();
@@ -334,16 +365,15 @@ fn silence_reason(halted: bool, state: Option<State>) -> &'static str {
 }
 
 /// Returns the contact state of a cell, if its torque can be computed from that state. Otherwise adds the reason to
-/// `missing`, if the cell answered or may be in contact.
+/// `missing`, if the cell answered or may be in contact. `target` is the hash of the configuration that the skin gives
+/// to the cell.
 fn usable_contact(
-    skin: &Skin,
     bus: &str,
-    cell: &Cell,
+    node: CellId,
+    target: u16,
     said: &ObservedCellState,
     missing: &mut Vec<String>,
 ) -> Option<(SkinSensors, ContactOrigin)> {
-    let node = cell.node;
-    let target = skin.parameters(cell).hash();
     let answered = said.answer.is_some();
     let touched = said.contact_state.is_some_and(|(sensors, _)| sensors != SkinSensors::default());
     match said.hash {

@@ -6,6 +6,8 @@
 use std::collections::BTreeMap;
 
 use model::decode::{Decoded, Decoder};
+use protocol::candump::Record;
+use protocol::message::Message;
 use protocol::packet::Epoch;
 use protocol::skin::{Skin, SkinReply};
 use protocol::time::Micros;
@@ -26,6 +28,8 @@ pub struct EpochTorque {
     pub at_ns: u64,
     /// The epoch, modulo 256.
     pub epoch: u8,
+    /// The epoch, continued beyond 255; 0 is the epoch of the first joints.
+    pub number: i64,
     /// The position of each joint of the robot in rad or m; `None` for a joint whose bus sent no joints in this epoch.
     pub positions: Vec<Option<f64>>,
     /// The derivation of the torques.
@@ -60,6 +64,36 @@ pub struct CaptureExtent {
     pub zero_ns: u64,
 }
 
+/// A receiver of the content of a capture that is read epoch by epoch.
+pub trait SeriesObserver {
+    /// The error that ends the reading.
+    type Error;
+
+    /// Receives a frame, with the message that it completes. `answered` are the joints that this message answers as a
+    /// torque which is used: their index among the joints of the bus that begin epochs.
+    ///
+    /// # Errors
+    /// Returns an error to end the reading.
+    fn receive_frame(
+        &mut self,
+        record: &Record<'_>,
+        message: Option<&Message>,
+        answered: Option<u64>,
+    ) -> Result<(), Self::Error>;
+
+    /// Receives an entry that is not a frame.
+    ///
+    /// # Errors
+    /// Returns an error to end the reading.
+    fn receive_note(&mut self, note: &CaptureNote<'_>) -> Result<(), Self::Error>;
+
+    /// Receives a complete epoch, with the time that counts as 0 s in ns since 1970.
+    ///
+    /// # Errors
+    /// Returns an error to end the reading.
+    fn receive_epoch(&mut self, zero: u64, epoch: &EpochTorque) -> Result<(), Self::Error>;
+}
+
 /// Reads a capture to its end. Each complete epoch is passed to `take`, with the time that counts as 0 s in ns since
 /// 1970. Memory is bounded.
 ///
@@ -69,9 +103,47 @@ pub struct CaptureExtent {
 pub fn for_each_epoch<E>(
     reader: &mut Reader,
     skin: &Skin,
-    mut note: impl FnMut(&CaptureNote<'_>),
-    mut take: impl FnMut(u64, &EpochTorque) -> Result<(), E>,
+    note: impl FnMut(&CaptureNote<'_>),
+    take: impl FnMut(u64, &EpochTorque) -> Result<(), E>,
 ) -> Result<CaptureExtent, EpochSeriesError<E>> {
+    observe_epochs(reader, skin, &mut EpochFunctions { note, take })
+}
+
+/// Two functions as an observer that does not need the frames.
+struct EpochFunctions<N, T> {
+    note: N,
+    take: T,
+}
+
+impl<E, N: FnMut(&CaptureNote<'_>), T: FnMut(u64, &EpochTorque) -> Result<(), E>> SeriesObserver
+    for EpochFunctions<N, T>
+{
+    type Error = E;
+
+    fn receive_frame(&mut self, _: &Record<'_>, _: Option<&Message>, _: Option<u64>) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn receive_note(&mut self, note: &CaptureNote<'_>) -> Result<(), E> {
+        (self.note)(note);
+        Ok(())
+    }
+
+    fn receive_epoch(&mut self, zero: u64, epoch: &EpochTorque) -> Result<(), E> {
+        (self.take)(zero, epoch)
+    }
+}
+
+/// Reads a capture to its end, and passes its frames, notes and complete epochs to an observer. Memory is bounded.
+///
+/// # Errors
+/// Returns [`EpochSeriesError`] if the capture cannot be read or has no joints of the skin, or with the first error of
+/// the observer.
+pub fn observe_epochs<O: SeriesObserver>(
+    reader: &mut Reader,
+    skin: &Skin,
+    observer: &mut O,
+) -> Result<CaptureExtent, EpochSeriesError<O::Error>> {
     let mut series = EpochJoiner::new(skin);
     let mut decoder = Decoder::new(None);
     for before in &reader.extras().latched {
@@ -85,26 +157,29 @@ pub fn for_each_epoch<E>(
     while let Some(entry) = reader.next()? {
         let record = match entry {
             CaptureEntry::Frame(record) => record,
-            CaptureEntry::Note(of_reader) => {
-                note(&of_reader);
+            CaptureEntry::Note(note) => {
+                observer.receive_note(&note).map_err(EpochSeriesError::Consumer)?;
                 continue;
             }
         };
         let nanos = record.time.nanos;
         counted.zero_ns = *zero.get_or_insert(nanos);
         let decoded = decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
-        let message = if let Decoded::Message(message) = &decoded { Some(message) } else { None };
+        let message = decoded.message();
         series.watch.receive(nanos, record.interface, message);
+        observer
+            .receive_frame(&record, message, series.watch.answered_joints())
+            .map_err(EpochSeriesError::Consumer)?;
         series.collect_complete_joints(false);
         while let Some(epoch) = series.pop_oldest_epoch(false) {
             counted.epochs += 1;
-            take(counted.zero_ns, &epoch).map_err(EpochSeriesError::Consumer)?;
+            observer.receive_epoch(counted.zero_ns, &epoch).map_err(EpochSeriesError::Consumer)?;
         }
     }
     series.collect_complete_joints(true);
     while let Some(epoch) = series.pop_oldest_epoch(true) {
         counted.epochs += 1;
-        take(counted.zero_ns, &epoch).map_err(EpochSeriesError::Consumer)?;
+        observer.receive_epoch(counted.zero_ns, &epoch).map_err(EpochSeriesError::Consumer)?;
     }
     if counted.epochs == 0
         && let Err(source) = series.watch.into_joints()
@@ -178,7 +253,7 @@ impl<'a> EpochJoiner<'a> {
         if !is_end && !is_passed && newest - number <= MAX_BUS_LAG_EPOCHS {
             return None;
         }
-        let (_, (epoch, moments)) = self.waiting.pop_first()?;
+        let (number, (epoch, moments)) = self.waiting.pop_first()?;
         let explanation = self.explainer.explain(&moments);
         let mut positions = vec![None; self.skin.robot.joints.len()];
         for bus in &explanation.buses {
@@ -189,6 +264,6 @@ impl<'a> EpochJoiner<'a> {
             }
         }
         let at_ns = moments.iter().flatten().map(|moment| moment.at_ns).min().unwrap_or_default();
-        Some(EpochTorque { at_ns, epoch: epoch.0, positions, explanation })
+        Some(EpochTorque { at_ns, epoch: epoch.0, number, positions, explanation })
     }
 }

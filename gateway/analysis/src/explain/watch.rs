@@ -31,6 +31,8 @@ pub struct JointsWatcher<'a> {
     bus_watches: Vec<BusWatch>,
     /// Names of the buses in the capture that are not in the skin.
     others: Vec<String>,
+    /// The joints that the torque in the last frame answers, if it is used.
+    answered: Option<u64>,
 }
 
 #[derive(Debug, Default)]
@@ -43,6 +45,8 @@ struct BusWatch {
     occurrences: u32,
     /// Joints whose answers may still arrive, oldest first.
     open: VecDeque<AnswerableJoints>,
+    /// Number of joints that were put into `open`.
+    opened: u64,
     cells: PerCell<WatchedCell>,
     runs: Vec<EpochRun>,
     /// The number of values in a joints packet whose length does not fit the chain.
@@ -57,6 +61,8 @@ struct AnswerableJoints {
     epoch: Epoch,
     moment: ObservedJoints,
     since: u32,
+    /// Number of joints on the bus before these.
+    index: u64,
 }
 
 #[derive(Clone, Debug, Default)]
@@ -91,7 +97,7 @@ impl<'a> JointsWatcher<'a> {
         let bus_watch =
             |bus| BusWatch { has_cells: skin.cells_on_bus(bus).next().is_some(), ..BusWatch::default() };
         let bus_watches = (0..skin.buses.len()).map(bus_watch).collect();
-        Self { skin, requested, zero: None, bus_watches, others: Vec::new() }
+        Self { skin, requested, zero: None, bus_watches, others: Vec::new(), answered: None }
     }
 
     /// Sets the time that counts as 0 s, in ns since 1970; the default is the time of the first frame.
@@ -117,6 +123,7 @@ impl<'a> JointsWatcher<'a> {
     /// Handles the next frame; `message` is the decoded message, if the frame completes one. Returns true if the
     /// requested joints and all answers to them are known.
     pub fn receive(&mut self, nanos: u64, bus: &str, message: Option<&Message>) -> bool {
+        self.answered = None;
         let zero = *self.zero.get_or_insert(nanos);
         let at = self.skin.bus_index(bus);
         let Some(bus_watch) = at.and_then(|at| self.bus_watches.get_mut(at)) else {
@@ -127,7 +134,7 @@ impl<'a> JointsWatcher<'a> {
         };
         bus_watch.is_in_capture = true;
         if let Some(message) = message {
-            bus_watch.receive_message(
+            self.answered = bus_watch.receive_message(
                 nanos,
                 nanos.saturating_sub(zero),
                 message,
@@ -136,6 +143,14 @@ impl<'a> JointsWatcher<'a> {
             );
         }
         self.is_complete()
+    }
+
+    /// Returns the joints that the last received torque answers, as their index among the bus' joints that
+    /// [`JointsWatcher::pop_joints`] returns. Returns `None` if the last frame contained no torque, or one that is not
+    /// used because it came too late, or because the cell had answered already.
+    #[must_use]
+    pub const fn answered_joints(&self) -> Option<u64> {
+        self.answered
     }
 
     /// Removes and returns the oldest joints of a bus, if their answers are complete. At the end of the capture
@@ -244,6 +259,7 @@ impl BusWatch {
         self.open.front().is_some_and(AnswerableJoints::is_complete)
     }
 
+    /// Handles a message. Returns the index of the joints that it answers, if it is a torque that is used.
     fn receive_message(
         &mut self,
         nanos: u64,
@@ -251,8 +267,9 @@ impl BusWatch {
         message: &Message,
         requested: Option<RequestedJoints>,
         robot: usize,
-    ) {
+    ) -> Option<u64> {
         let last = self.last;
+        let mut answered = None;
         match *message {
             Message::Halt => self.halted = true,
             Message::Resume => self.halted = false,
@@ -285,7 +302,7 @@ impl BusWatch {
                 let hash = match Parameter::from_number(number) {
                     Some(Parameter::Commit) if written => commit,
                     Some(Parameter::Identity) => identity,
-                    Some(_) | None => return,
+                    Some(_) | None => return None,
                 };
                 if let Some(cell) = self.cells.get_mut(from) {
                     cell.hash = Some(hash);
@@ -312,16 +329,17 @@ impl BusWatch {
                     cell.contact.apply_reported_page(page, origin);
                 }
                 // A measuring cell has read its sensors at these very joints.
-                if let Some((cell, _)) = self.answering_cell(from, epoch) {
+                if let Some((cell, ..)) = self.answering_cell(from, epoch) {
                     cell.contact_state.get_or_insert((skin, origin));
                 }
             }
             Message::Torque { from, epoch, torque } => {
-                if let Some((cell, in_time)) = self.answering_cell(from, epoch) {
+                if let Some((cell, in_time, index)) = self.answering_cell(from, epoch) {
                     if cell.answer.is_some() {
                         cell.repeated += 1;
                     } else if in_time {
                         cell.answer = Some((nanos, torque));
+                        answered = Some(index);
                     } else {
                         cell.too_late.get_or_insert(nanos);
                     }
@@ -335,6 +353,7 @@ impl BusWatch {
             | Message::Configure { .. }
             | Message::Configured { .. } => {}
         }
+        answered
     }
 
     fn receive_joints(
@@ -365,7 +384,8 @@ impl BusWatch {
                     ..ObservedCellState::default()
                 });
             let moment = ObservedJoints { at_ns: nanos, joints, halted: self.halted, cells: cells.collect() };
-            self.open.push_back(AnswerableJoints { epoch, moment, since: 0 });
+            self.open.push_back(AnswerableJoints { epoch, moment, since: 0, index: self.opened });
+            self.opened += 1;
         }
     }
 
@@ -387,11 +407,12 @@ impl BusWatch {
         }
     }
 
-    /// Returns the state of the cell at the newest joints of this epoch, and true if an answer is still in time.
-    fn answering_cell(&mut self, from: CellId, epoch: Epoch) -> Option<(&mut ObservedCellState, bool)> {
+    /// Returns the state of the cell at the newest joints of this epoch, true if an answer is still in time, and the
+    /// index of these joints.
+    fn answering_cell(&mut self, from: CellId, epoch: Epoch) -> Option<(&mut ObservedCellState, bool, u64)> {
         let open = self.open.iter_mut().rev().find(|open| open.epoch == epoch)?;
-        let in_time = !open.is_too_late();
-        Some((open.moment.cells.get_mut(from.index())?, in_time))
+        let (in_time, index) = (!open.is_too_late(), open.index);
+        Some((open.moment.cells.get_mut(from.index())?, in_time, index))
     }
 
     /// Sets the configuration hash of a cell at all joints that are still open: it was the same then, but is reported
