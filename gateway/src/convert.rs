@@ -1,5 +1,6 @@
 //! `skinbus convert`.
 
+mod columns;
 mod live;
 mod torques;
 
@@ -37,10 +38,12 @@ const MAX_REPORTED_LINES: u64 = 100;
 /// Number of bytes written at once.
 const WRITE_BYTES: usize = 1 << 18;
 
-/// Convert a capture between candump log and MCAP recording, or its torques to CSV
+/// Convert a capture between candump log and MCAP recording, or to CSV or NumPy files
 ///
 /// Detects the format of IN from its first bytes, and that of OUT from its name: .mcap is a recording, .log or .txt a
 /// candump log, - a log on standard output, and .csv the torques of each epoch, as computed by `skinbus explain`.
+/// .columns is a folder of NumPy files with all frames, joints, torques and contacts, which `skinbus.read` of the
+/// Python package opens.
 /// Frames are preserved bit for bit: times, bus names, directions, FD flags, raw DLCs, error and remote frames.
 /// Comments, drop lines and unreadable lines keep their places. Information that OUT cannot hold is reported. OUT
 /// appears when it is complete. For a pipe it grows within a tenth of a second of the input: a log under its name, a
@@ -52,13 +55,14 @@ const WRITE_BYTES: usize = 1 << 18;
   skinbus convert run.mcap - --plain | log2asc -I /dev/stdin vcan0
   skinbus convert run.mcap torques.csv
   skinbus convert run.log torques.csv --skin skin.toml
+  skinbus convert run.mcap run-*.mcap run.columns
   candump -L can0 | skinbus convert - can0.mcap")]
 pub(crate) struct ConvertCommand {
     /// A candump log or an MCAP recording; - for standard input. Several are read as one: the parts of a split
     /// recording in any order, other captures in the order of their first frames
     #[arg(value_name = "IN", required = true)]
     from: Vec<PathBuf>,
-    /// The new capture or CSV file; - for candump text on standard output
+    /// The new capture, CSV file or folder of columns; - for candump text on standard output
     #[arg(value_name = "OUT")]
     to: PathBuf,
     #[command(flatten)]
@@ -76,7 +80,7 @@ pub(crate) struct ConvertCommand {
     /// Write only what every tool can read: time stamps with 6 decimals, and no directions, raw DLCs or comments
     #[arg(long)]
     plain: bool,
-    /// For a CSV file: the skin [default: the skin in the recording]
+    /// For a CSV file or columns: the skin [default: the skin in the recording]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
 }
@@ -91,17 +95,18 @@ impl ConvertCommand {
         if torques::is_csv(&self.to) {
             return self.write_torques();
         }
+        if columns::is_columns(&self.to) {
+            return self.write_columns();
+        }
         if let Some(skin) = &self.skin {
             return Err(Failure::usage_error(format!(
-                "--skin {} is only for CSV output: name an OUT that ends in .csv",
+                "--skin {} is only for CSV and columns: name an OUT that ends in .csv or .columns",
                 skin.display()
             )));
         }
         let format = self.format()?;
         let text = format == CaptureFormat::Candump;
-        let options =
-            [("--plain", self.plain), ("--direction", self.direction), ("--digits", self.digits.is_some())];
-        if let Some((option, _)) = options.iter().find(|(_, given)| *given && !text) {
+        if let Some(option) = self.text_option().filter(|_| !text) {
             return Err(Failure::usage_error(format!(
                 "{option} is only for a candump log: leave it out, because a recording keeps everything"
             )));
@@ -233,16 +238,26 @@ impl ConvertCommand {
         write_error(&self.to, &left, error)
     }
 
+    /// Returns an option that is given and has an effect only on a candump log.
+    fn text_option(&self) -> Option<&'static str> {
+        let options =
+            [("--plain", self.plain), ("--direction", self.direction), ("--digits", self.digits.is_some())];
+        options.into_iter().find(|(_, given)| *given).map(|(option, _)| option)
+    }
+
+    /// Refuses options for candump logs, because OUT is `what`.
+    fn check_text_options(&self, what: &str) -> Result<(), Failure> {
+        let Some(option) = self.text_option() else { return Ok(()) };
+        let to = self.to.display();
+        Err(Failure::usage_error(format!(
+            "{option} is only for a candump log, but {to} is {what}: leave it out"
+        )))
+    }
+
     /// Writes the torque of every epoch to a CSV file.
     fn write_torques(&self) -> Result<(), Failure> {
         let to = self.to.display();
-        let options =
-            [("--plain", self.plain), ("--direction", self.direction), ("--digits", self.digits.is_some())];
-        if let Some((option, _)) = options.iter().find(|(_, given)| *given) {
-            return Err(Failure::usage_error(format!(
-                "{option} is only for a candump log, but {to} is a CSV file: leave it out"
-            )));
-        }
+        self.check_text_options("a CSV file")?;
         check_distinct_files([("", Some(self.to.as_path()))], self.from.iter().map(PathBuf::as_path))?;
         self.overwrite.check_writable("", &self.to)?;
         let skin = named_or_recorded_skin(&self.from, self.skin.as_deref())?;
@@ -319,8 +334,8 @@ impl ConvertCommand {
             Some("log" | "txt") => Ok(CaptureFormat::Candump),
             _ if is_standard_output(&self.to) || other => Ok(CaptureFormat::Candump),
             _ => Err(Failure::usage_error(format!(
-                "{}: unknown file type: use .mcap for a recording, .log or .txt for a candump log, .csv for torques, or - for \
-                 standard output",
+                "{}: unknown file type: use .mcap for a recording, .log or .txt for a candump log, .csv for torques, .columns for \
+                 NumPy files, or - for standard output",
                 self.to.display()
             ))),
         }

@@ -258,11 +258,11 @@ pub(crate) struct LossCounts {
     /// Number of unreadable lines.
     pub(crate) lines: u64,
     /// Number of unreadable messages.
-    messages: u64,
+    pub(crate) messages: u64,
     /// Number of frames that the recorder lost.
     pub(crate) frames: u64,
     /// Number of CAN XL frames.
-    can_xl: u64,
+    pub(crate) can_xl: u64,
 }
 
 impl LossCounts {

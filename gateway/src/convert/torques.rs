@@ -70,7 +70,7 @@ struct TorqueRows<W: Write> {
 impl<W: Write> TorqueRows<W> {
     /// Writes a row with the torques that `skinbus explain` shows. Seconds count from `zero`, in ns since 1970.
     fn write_row(&mut self, zero: u64, epoch: &EpochTorque) -> Result<(), csv::Error> {
-        let EpochTorque { at_ns, epoch, positions, explanation } = epoch;
+        let EpochTorque { at_ns, epoch, positions, explanation, .. } = epoch;
         let seconds = seconds_since(zero, *at_ns);
         let mut row = vec![format!("{seconds:.9}"), epoch.to_string()];
         let joints = positions.iter().zip(&explanation.total).zip(&self.summed);

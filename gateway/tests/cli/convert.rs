@@ -240,8 +240,8 @@ fn an_output_that_exists_is_left_alone_unless_it_is_to_be_overwritten() {
     );
     assert_eq!(
         folder.refuses("convert run.log . --overwrite", 2),
-        "skinbus: .: unknown file type: use .mcap for a recording, .log or .txt for a candump log, .csv for torques, or - for \
-         standard output"
+        "skinbus: .: unknown file type: use .mcap for a recording, .log or .txt for a candump log, .csv for torques, .columns for \
+         NumPy files, or - for standard output"
     );
     folder.says("convert run.log run.mcap --overwrite", 0);
     folder.says("convert run.mcap run.log --overwrite", 0);

@@ -1,5 +1,6 @@
 //! The commands as processes: what they print, write and refuse.
 
+mod columns;
 mod commands;
 mod compare;
 mod convert;

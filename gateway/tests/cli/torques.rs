@@ -175,7 +175,7 @@ fn what_has_no_torques_is_refused_in_one_line_and_nothing_is_written() {
         (
             "fd.mcap out.log --skin fd.toml",
             2,
-            "skinbus: --skin fd.toml is only for CSV output: name an OUT that ends in .csv",
+            "skinbus: --skin fd.toml is only for CSV and columns: name an OUT that ends in .csv or .columns",
         ),
         (
             "fd.mcap mine.csv",
