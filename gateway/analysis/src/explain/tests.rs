@@ -289,3 +289,18 @@ fn a_late_stimulus_is_called_late_and_a_written_mode_forgets_it() {
     let written = [before, &[mode], joints].concat();
     assert_eq!(origin(&written), Some((ContactOrigin::Mode { at_ns: 4_000_000 }, 0)));
 }
+
+#[test]
+fn joints_of_a_bus_without_cells_are_not_kept() {
+    let bus = "[[bus]]\nname = \"vcan1\"\nreply = \"torque\"\nformat = \"fd\"\n\n[controller]";
+    let text = model::testing::ONE_CELL_SKIN_TOML.replace("[controller]", bus);
+    let skin = Skin::parse("two.toml", &text).unwrap();
+    let mut watch = JointsWatcher::for_all_joints(&skin);
+    for (at, epoch) in (1..).zip(0..3) {
+        for bus in ["vcan0", "vcan1"] {
+            watch.receive(at * 1_000_000, bus, Some(&joints(epoch)));
+        }
+    }
+    assert_eq!(watch.pop_joints(0, true).map(|(epoch, _)| epoch), Some(Epoch(0)));
+    assert!(watch.pop_joints(1, true).is_none());
+}
