@@ -28,7 +28,12 @@ pub(super) struct ControlBus {
     /// The number of joints on the bus, which is the number of the present epoch.
     number: u64,
     presses: PendingPresses,
+    /// The time since which the bus is lost without an event. The buses of a run are also lost at its end.
+    lost_since: Option<Micros>,
 }
+
+/// The time after which the loss of a bus is reported, in µs.
+const LOSS_REPORT_DELAY_US: u64 = 100_000;
 
 /// A cell of a controlled run.
 #[derive(Clone, Copy, Debug)]
@@ -38,6 +43,8 @@ struct ControlledCell {
     j_error: f64,
     subtracts_baseline: bool,
     is_touched: bool,
+    /// True if the cell answers joints, as far as was seen.
+    is_ready: bool,
     last_packet: Micros,
 }
 
@@ -50,6 +57,7 @@ impl ControlBus {
                 j_error: (MAX_J_ERROR_STEPS + f64::from(further_rows)) / 16_384.0,
                 subtracts_baseline: cell.baseline != Baseline::Off,
                 is_touched: false,
+                is_ready: false,
                 last_packet: Micros(0),
             }
         });
@@ -58,6 +66,7 @@ impl ControlBus {
             cells: cells.collect(),
             number: 0,
             presses: PendingPresses::default(),
+            lost_since: None,
         }
     }
 
@@ -84,6 +93,11 @@ impl ControlBus {
     /// Returns true if joints and a heartbeat of each cell were received.
     pub(super) fn is_complete(&self) -> bool {
         self.number > 0 && self.live.table.cells().iter().all(|cell| cell.heartbeat().is_some())
+    }
+
+    /// Returns true if an epoch is complete, so that its torques are known.
+    pub(super) const fn has_complete_epoch(&self) -> bool {
+        self.live.previous.is_some()
     }
 
     /// Returns position, distributed torque and central torque of each joint of the chain.
@@ -239,10 +253,21 @@ impl ControlBus {
 
     /// Handles the time: cells become silent, and presses expire.
     pub(super) fn handle_time(&mut self, now: Micros, events: &mut Vec<ControlEvent>) {
+        if self.lost_since.is_some_and(|since| now.elapsed_since(since).0 > LOSS_REPORT_DELAY_US) {
+            self.lost_since = None;
+            events.push(self.bus_event(false));
+        }
         let notices = self.live.handle_time(now);
         self.apply_notices(notices, now, events);
         let Self { live, cells, presses, .. } = self;
         let statuses: Vec<_> = live.table.statuses(now).map(|(_, status)| status).collect();
+        for (cell, state) in cells.iter_mut().zip(live.table.cells()) {
+            let was_ready = std::mem::replace(&mut cell.is_ready, state.is_ready());
+            if cell.is_ready && !was_ready {
+                let name = format!("{}:{}", live.name, cell.node);
+                events.push(ControlEvent::Cell { cell: name, state: CellChange::Ready });
+            }
+        }
         let expired = presses.take_expired(now, |node| {
             let place = live.table.index_of(node);
             let cell = place.and_then(|place| live.table.cells().get(place));
@@ -323,11 +348,27 @@ impl ControlBus {
         self.live.sensors(node, now)
     }
 
-    /// Sets the state of the bus. Returns true if it was lost, or works again.
-    pub(super) fn set_state(&mut self, is_up: bool, dropped: u64) -> bool {
+    /// Handles the state of the bus: whether it works, and the number of frames that were not received. Reports a bus
+    /// that works again, with a loss that was not reported yet.
+    pub(super) fn handle_state(
+        &mut self,
+        now: Micros,
+        is_up: bool,
+        dropped: u64,
+        events: &mut Vec<ControlEvent>,
+    ) {
         let was_up = self.live.is_up;
         self.live.set_state(is_up, dropped);
-        was_up != is_up
+        if is_up && !was_up {
+            let loss = self.lost_since.take().map(|_| false);
+            events.extend(loss.into_iter().chain([true]).map(|up| self.bus_event(up)));
+        } else if was_up && !is_up {
+            self.lost_since = Some(now);
+        }
+    }
+
+    fn bus_event(&self, up: bool) -> ControlEvent {
+        ControlEvent::Bus { bus: self.name().to_owned(), up }
     }
 
     pub(super) fn report(&self) -> ReportedBus {

@@ -11,6 +11,7 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use bench::bus::follow::FollowedItem;
+use bench::bus::listen::now;
 use bench::remote::{BenchCommand, BenchState, JsonPipe};
 use protocol::bus::KindChoices;
 use protocol::message::Message;
@@ -141,7 +142,7 @@ fn serve(
                             state.handle_frame(index, received.at_nanos, &received.frame);
                         }
                     });
-                    state.handle_bus_state(index, !follower.is_lost(), follower.dropped_frames());
+                    state.handle_bus_state(now(), index, !follower.is_lost(), follower.dropped_frames());
                     let ControlOutput { messages, .. } = push_events(&mut state, events);
                     drop(state);
                     send_messages(buses, &messages);

@@ -1,6 +1,6 @@
 //! Events of a run, one JSON object a line. `docs/reference/control.md` describes them.
 
-use bench::remote::TickLateness;
+use model::quantiles::Quantiles;
 use serde::Serialize;
 use serde_json::Value;
 
@@ -140,8 +140,10 @@ pub enum ControlEvent {
         joints: JointTorques,
         /// The cells that are not quiet.
         cells: Vec<ReportedCell>,
-        /// Lateness of the ticks.
-        lateness: TickLateness,
+        /// Lateness of all ticks up to the last full second in µs; `None` in the first second.
+        lateness_us: Option<Quantiles>,
+        /// The number of ticks that were skipped because they were late by a period or more.
+        skipped: u64,
     },
     /// The reader was too slow, so that events were dropped.
     Dropped {
@@ -170,8 +172,8 @@ pub struct ReadyBus {
     pub kind: &'static str,
     /// The format of its frames, `fd` or `classic`.
     pub format: &'static str,
-    /// True if its cells answer with sums.
-    pub sums: bool,
+    /// The packets with which its cells answer, `torque` or `sum`.
+    pub reply: &'static str,
     /// The folder of the socket of an embedded bus.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub directory: Option<String>,
@@ -197,9 +199,9 @@ pub struct AskedStimulus {
 pub struct JointTorques {
     /// Positions in rad or m.
     pub positions: Vec<f64>,
-    /// The sums of the torques that the cells sent, in Nm or N.
+    /// The sums of the torques that the cells sent, in Nm or N; empty before the first complete epoch.
     pub distributed: Vec<f64>,
-    /// The torques computed centrally from the cells' stimuli, in Nm or N.
+    /// The torques computed centrally from the cells' stimuli, in Nm or N; empty before the first complete epoch.
     pub central: Vec<f64>,
 }
 
@@ -245,6 +247,8 @@ pub enum CellChange {
     Dead,
     /// The cell has restarted.
     Restarted,
+    /// The cell answers joints.
+    Ready,
 }
 
 /// The reason why no torque shows a press or a release.

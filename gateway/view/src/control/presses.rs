@@ -23,6 +23,9 @@ pub(super) const LEAD_EPOCHS: u64 = 2;
 const ANSWER_EPOCHS: u64 = 3;
 /// The time without joints after which a press expires, in µs.
 const SILENCE_TIMEOUT_US: u64 = 1_000_000;
+/// The time after the last of these epochs for which a cell that is alive may still answer a later one, in µs. A cell
+/// without processor time skips old joints.
+const LATE_ANSWER_TIMEOUT_US: u64 = 600_000;
 
 /// A press or a release, with the number of the epoch that it asks for.
 #[derive(Clone, Debug, PartialEq)]
@@ -113,8 +116,11 @@ impl PendingPresses {
     /// Returns the press whose stimulus the cell computed with in the epoch with this number, if it is pending.
     pub(super) fn pending_in(&self, cell: CellId, epoch: u64) -> Option<&Press> {
         let mut sent = self.sent.iter();
-        sent.find(|sent| sent.press.cell == cell && (sent.press.first..=sent.last()).contains(&epoch))
-            .map(|sent| &sent.press)
+        sent.find(|sent| {
+            let is_replaced = sent.replaced.is_some_and(|replaced| epoch >= replaced);
+            sent.press.cell == cell && epoch >= sent.press.first && !is_replaced
+        })
+        .map(|sent| &sent.press)
     }
 
     /// Removes a press that a torque has shown, or that cannot be shown.
@@ -157,7 +163,12 @@ impl PendingPresses {
                 return true;
             };
             // A cell that has sent a packet since then is alive.
-            let fallback = || (last_packet > expired).then(|| sent.unanswered_reason());
+            let is_over = now.elapsed_since(expired).0 > LATE_ANSWER_TIMEOUT_US;
+            let fallback = || {
+                let reason = sent.unanswered_reason();
+                let may_answer = reason == UnconfirmedReason::NoAnswer && !is_over;
+                (last_packet > expired && !may_answer).then_some(reason)
+            };
             let reason = match sent.seen {
                 Some(UnconfirmedReason::OtherTorque) => present.or(sent.seen),
                 seen => seen.or(present).or_else(fallback),
@@ -257,7 +268,7 @@ mod tests {
         assert_eq!(begin(&mut presses, 11), [4]);
         assert_eq!(presses.pending_in(cell(), 12).map(number), Some(1));
         assert_eq!(presses.pending_in(cell(), 13).map(number), Some(4));
-        assert_eq!(presses.pending_in(cell(), 16).map(number), None);
+        assert_eq!(presses.pending_in(cell(), 16).map(number), Some(4));
         begin(&mut presses, 12);
         assert_eq!(expired(&mut presses, 12, ALIVE), []);
         begin(&mut presses, 13);
@@ -271,7 +282,6 @@ mod tests {
     #[test]
     fn a_press_expires_after_three_epochs_with_the_reason_that_is_known_first() {
         for (force_n, seen, state, expected) in [
-            (1.0, None, ALIVE, Some(UnconfirmedReason::NoAnswer)),
             (0.0, None, ALIVE, Some(UnconfirmedReason::NotTouched)),
             (1.0, Some(UnconfirmedReason::NoTorque), ALIVE, Some(UnconfirmedReason::NoTorque)),
             (1.0, None, (Some(UnconfirmedReason::Halted), Micros(0)), Some(UnconfirmedReason::Halted)),
@@ -284,7 +294,8 @@ mod tests {
             (1.0, Some(UnconfirmedReason::OtherTorque), ALIVE, Some(UnconfirmedReason::OtherTorque)),
             // A silent cell may be dead: its next packet or its death decides.
             (1.0, None, (None, Micros(15 * 16_000)), None),
-            (1.0, None, (None, Micros(15 * 16_000 + 1)), Some(UnconfirmedReason::NoAnswer)),
+            (0.0, None, (None, Micros(15 * 16_000)), None),
+            (0.0, None, (None, Micros(15 * 16_000 + 1)), Some(UnconfirmedReason::NotTouched)),
         ] {
             let mut presses = PendingPresses::default();
             begin(&mut presses, 10);
@@ -300,6 +311,20 @@ mod tests {
             let expected: Vec<_> = expected.into_iter().map(|reason| (1, reason)).collect();
             assert_eq!(expired(&mut presses, 15, state), expected, "{force_n} {seen:?} {state:?}");
         }
+    }
+
+    #[test]
+    fn a_cell_that_is_alive_may_answer_a_later_epoch() {
+        let mut presses = PendingPresses::default();
+        begin(&mut presses, 10);
+        let added = press(&presses, 1, 1.0, 10);
+        presses.add(added, 10, |_| {});
+        (11..=52).for_each(|now| assert!(begin(&mut presses, now).is_empty()));
+        assert_eq!(expired(&mut presses, 52, ALIVE), []);
+        assert_eq!(presses.pending_in(cell(), 52).map(number), Some(1));
+        begin(&mut presses, 53);
+        assert_eq!(expired(&mut presses, 53, ALIVE), [(1, UnconfirmedReason::NoAnswer)]);
+        assert_eq!(presses.pending_in(cell(), 53).map(number), None);
     }
 
     #[test]

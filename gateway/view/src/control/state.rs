@@ -3,7 +3,7 @@
 use std::collections::{BTreeSet, VecDeque};
 use std::mem;
 
-use bench::remote::{BenchCommand, BenchState};
+use bench::remote::{BenchCommand, BenchState, TickLateness};
 use model::scenario::contact_words;
 use protocol::can::Frame;
 use protocol::id::{CellId, Node};
@@ -58,6 +58,7 @@ pub struct ControlState {
     /// The cells that this program presses.
     pressed: BTreeSet<(usize, CellId)>,
     is_ending: bool,
+    has_input_ended: bool,
     output: ControlOutput,
 }
 
@@ -80,6 +81,7 @@ impl ControlState {
             every: 0,
             pressed: BTreeSet::new(),
             is_ending: false,
+            has_input_ended: false,
             output: ControlOutput::default(),
         }
     }
@@ -103,8 +105,8 @@ impl ControlState {
 
     /// Handles the end of the input: the run ends after the commands before it.
     pub fn handle_end_of_input(&mut self, now: Micros) {
-        let command = ControlCommand::End {};
-        self.handle_line(now, InputLine::Request(Request { id: None, command }));
+        self.has_input_ended = true;
+        self.handle_waiting_lines(now);
     }
 
     /// Handles a frame of the bus with this index.
@@ -122,10 +124,11 @@ impl ControlState {
     }
 
     /// Handles the state of a bus: whether it works, and the number of frames that were not received.
-    pub fn handle_bus_state(&mut self, bus: usize, is_up: bool, dropped: u64) {
+    pub fn handle_bus_state(&mut self, now: Micros, bus: usize, is_up: bool, dropped: u64) {
         let Some(of) = self.buses.get_mut(bus) else { return };
-        if of.set_state(is_up, dropped) && self.is_ready {
-            self.output.events.push(ControlEvent::Bus { bus: of.name().to_owned(), up: is_up });
+        of.handle_state(now, is_up, dropped, &mut self.output.events);
+        if !self.is_ready {
+            self.output.events.clear();
         }
     }
 
@@ -213,7 +216,7 @@ impl ControlState {
                 bus: bus.name.clone(),
                 kind,
                 format: bus.format.name(),
-                sums: self.buses.get(index).is_some_and(ControlBus::sums),
+                reply: if self.buses.get(index).is_some_and(ControlBus::sums) { "sum" } else { "torque" },
                 directory,
                 joints: joints.filter_map(|(joint, _)| joint_names.get(joint).cloned()).collect(),
                 cells: cells.map(|cell| cell.node.get()).collect(),
@@ -245,6 +248,13 @@ impl ControlState {
                 }
                 None => return,
             }
+        }
+        if self.is_ready
+            && self.has_input_ended
+            && self.waiting.is_empty()
+            && !mem::replace(&mut self.is_ending, true)
+        {
+            self.output.commands.push(BenchCommand::End);
         }
     }
 
@@ -415,7 +425,13 @@ impl ControlState {
             cells.extend(bus.reported_cells(now));
         }
         let buses = self.buses.iter().map(ControlBus::report).collect::<Vec<ReportedBus>>();
-        ControlEvent::Report { id, buses, joints: all, cells, lateness: self.bench.lateness }
+        let TickLateness { all: lateness_us, skipped, .. } = self.bench.lateness;
+        if !self.buses.iter().all(ControlBus::has_complete_epoch) {
+            all.distributed.clear();
+            all.central.clear();
+        }
+        let lateness_us = Some(lateness_us).filter(|lateness| lateness.count > 0);
+        ControlEvent::Report { id, buses, joints: all, cells, lateness_us, skipped }
     }
 
     /// Finds the cell that a command names.
