@@ -136,7 +136,15 @@ impl ControlCommand {
             Self::Stop { cell } => Some((ProcessAction::Stop, cell)),
             Self::Continue { cell } => Some((ProcessAction::Continue, cell)),
             Self::Restart { cell } => Some((ProcessAction::Restart, cell)),
-            _ => None,
+            Self::Press { .. }
+            | Self::Release { .. }
+            | Self::Halt {}
+            | Self::Resume {}
+            | Self::Bus { .. }
+            | Self::Link { .. }
+            | Self::Epochs { .. }
+            | Self::Report {}
+            | Self::End {} => None,
         }
     }
 }
@@ -146,7 +154,9 @@ impl<'de> Deserialize<'de> for CellReference {
         match Value::deserialize(deserializer)? {
             Value::Number(number) => Ok(Self(number.to_string())),
             Value::String(text) => Ok(Self(text)),
-            other => Err(de::Error::custom(format!("cell {other}: use a node id or \"BUS:NODE\""))),
+            other @ (Value::Null | Value::Bool(_) | Value::Array(_) | Value::Object(_)) => {
+                Err(de::Error::custom(format!("cell {other}: use a node id or \"BUS:NODE\"")))
+            }
         }
     }
 }
@@ -186,10 +196,10 @@ impl TryFrom<Value> for RequestId {
         match value {
             Value::Number(number) => Ok(Self::Number(number)),
             Value::String(text) if text.len() <= MAX_ID_BYTES => Ok(Self::Text(text)),
-            other => Err(format!(
-                "id {}: use a number, or a text of at most {MAX_ID_BYTES} bytes",
-                kind_of(&other)
-            )),
+            other
+            @ (Value::Null | Value::Bool(_) | Value::String(_) | Value::Array(_) | Value::Object(_)) => Err(
+                format!("id {}: use a number, or a text of at most {MAX_ID_BYTES} bytes", kind_of(&other)),
+            ),
         }
     }
 }

@@ -211,7 +211,7 @@ impl ControlState {
         let buses = self.skin.buses.iter().enumerate().map(|(index, bus)| {
             let (kind, directory) = self.places.get(index).cloned().unwrap_or_default();
             let cells = self.skin.cells.iter().filter(|cell| cell.bus == index);
-            let joints = self.skin.joints_on_bus(index).into_iter();
+            let joints = self.skin.joints_on_bus(index);
             ReadyBus {
                 bus: bus.name.clone(),
                 kind,
@@ -314,7 +314,16 @@ impl ControlState {
                     Ok(BenchCommand::Link { down: *down, bus: one.0, nodes: [one.1.get(), other.1.get()] })
                 }),
             ControlCommand::End {} => Ok(BenchCommand::End),
-            _ => return None,
+            ControlCommand::Press { .. }
+            | ControlCommand::Release { .. }
+            | ControlCommand::Halt {}
+            | ControlCommand::Resume {}
+            | ControlCommand::Kill { .. }
+            | ControlCommand::Stop { .. }
+            | ControlCommand::Continue { .. }
+            | ControlCommand::Restart { .. }
+            | ControlCommand::Epochs { .. }
+            | ControlCommand::Report {} => return None,
         })
     }
 
@@ -366,7 +375,13 @@ impl ControlState {
                 self.output.events.push(report);
                 Ok(Some("report the state".to_owned()))
             }
-            _ => Ok(None),
+            ControlCommand::Kill { .. }
+            | ControlCommand::Stop { .. }
+            | ControlCommand::Continue { .. }
+            | ControlCommand::Restart { .. }
+            | ControlCommand::Bus { .. }
+            | ControlCommand::Link { .. }
+            | ControlCommand::End {} => Ok(None),
         }
     }
 
@@ -414,7 +429,7 @@ impl ControlState {
         let mut cells = Vec::new();
         for (index, bus) in self.buses.iter().enumerate() {
             for ((joint, _), [position, distributed, central]) in
-                self.skin.joints_on_bus(index).into_iter().zip(bus.joint_values())
+                self.skin.joints_on_bus(index).zip(bus.joint_values())
             {
                 let sums = [(&mut all.distributed, distributed), (&mut all.central, central)];
                 for (values, value) in sums {

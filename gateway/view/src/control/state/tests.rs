@@ -106,9 +106,8 @@ fn commands_are_carried_out_in_their_order() {
         json!({"event": "accepted", "id": 6, "do": "press", "cell": "vcan0:1", "force_n": 3.0, "epoch": epoch}),
     ];
     assert_eq!(played.events(), expected);
-    let from = |message: &Message| match message {
-        Message::Stimulus { from, .. } => Some(*from),
-        _ => None,
+    let from = |message: &Message| {
+        if let Message::Stimulus { from, .. } = message { Some(*from) } else { None }
     };
     let sent: Vec<_> =
         played.state.output.messages.iter().map(|(bus, message)| (*bus, from(message))).collect();
