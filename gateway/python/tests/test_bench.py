@@ -62,6 +62,8 @@ def test_a_force_below_the_threshold_is_not_confirmed(bench: Bench) -> None:
         bench.press(12, 0.01)
     assert caught.value.reason == "below-threshold"
     bench.release(11)
+    with pytest.raises(Unconfirmed):
+        bench.press(11, 0)
 
 
 def test_wrong_commands_are_refused(bench: Bench) -> None:
@@ -180,8 +182,10 @@ def test_an_error_in_the_skin_is_the_program_s_line(tmp_path: Path) -> None:
     with pytest.raises(RunFailed, match=r"wrong.toml") as caught, Bench(wrong):
         pass
     assert caught.value.code == 2
-    with pytest.raises(RunFailed, match=r"missing.toml"), Bench(tmp_path / "missing.toml"):
-        pass
+    missing = Bench(tmp_path / "missing.toml")
+    with pytest.raises(RunFailed, match=r"missing.toml"):
+        missing.start()
+    assert missing.exit_code == 2
 
 
 def test_cells_of_another_process(skin: Path, tmp_path: Path) -> None:
@@ -232,7 +236,11 @@ def test_descriptions_have_the_documented_fields(bench: Bench) -> None:
     bench.wait_epochs(100)
     lateness = bench.report().lateness_us
     assert lateness is not None
-    assert lateness.max >= lateness.p50 > 0
+    assert lateness.max >= lateness.p90 >= lateness.p50 > 0
+    (bus,) = bench.report().buses
+    assert bus.number >= 100
+    assert bus.epoch is not None
+    assert bus.dropped_frames >= 0
 
 
 def test_two_benches_are_apart(skin: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
 import threading
@@ -61,6 +63,8 @@ def test_a_cell_that_was_not_touched_may_be_released(fake: Bench) -> None:
     press = fake.release(5)
     with pytest.raises(Unconfirmed, match="not-touched"):
         press.wait()
+    with pytest.raises(Unconfirmed, match="not-touched"):
+        fake.press(5, 0)
 
 
 def test_a_press_that_is_not_answered_is_repeated_twice(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,6 +134,27 @@ def test_epochs_are_counted_only_while_waited_for(fake: Bench) -> None:
     assert commands(fake)[-1]["every"] == 0
     with pytest.raises(TimeoutError, match="100 epochs"):
         fake.wait_epochs(100, timeout=0.1)
+
+
+@pytest.mark.parametrize("mode", ["no-begin", "no-end", "refuse-end"])
+def test_epochs_whose_command_fails_are_counted_later(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FAKE", mode)
+    with Bench("skin.toml", timeout=0.5) as bench:
+        if mode == "no-begin":
+            with pytest.raises(TimeoutError, match="epochs: no answer"):
+                bench.wait_epochs(1)
+        else:
+            bench.wait_epochs(1)
+        bench.wait_epochs(2)
+        # The stand-in never accepts the end of epochs in the last mode.
+        expected = {"no-begin": [1, 0], "no-end": [1, 1, 0], "refuse-end": [1, 1]}
+        assert [command["every"] for command in commands(bench)] == expected[mode]
+
+
+def test_a_report_has_the_documented_fields(fake: Bench) -> None:
+    report = fake.report()
+    assert (report.buses[0].epoch, report.buses[0].number, report.buses[0].dropped_frames) == (21, 277, 3)
+    assert report.lateness_us == skinbus.events.Lateness(p50=20, p90=25, p99=30, max=99)
 
 
 def test_commands_of_many_threads_have_their_own_answers(fake: Bench) -> None:
@@ -203,6 +228,7 @@ def test_a_run_that_cannot_start_raises_its_line(monkeypatch: pytest.MonkeyPatch
     assert caught.value.notes[0] == "skin.toml:3: joint 9 is not a joint"
     assert bench.directory is not None
     assert not bench.directory.exists()
+    assert bench.exit_code == 2
 
 
 def test_a_run_that_is_killed_raises_what_it_wrote_last(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -241,6 +267,52 @@ def test_a_run_that_hangs_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench("skin.toml").start()
     bench.end(check=False)
     assert bench.exit_code == -9
+
+
+@pytest.mark.parametrize("is_writing", [False, True])
+def test_a_run_that_is_stopped_with_a_full_pipe_is_killed(is_writing: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("skinbus.bench._END_TIMEOUT", 0.5)
+    monkeypatch.setattr("skinbus._run._SIGNAL_TIMEOUT", 0.5)
+    bench = Bench("skin.toml").start()
+    assert bench._run is not None
+    run, pipe = bench._run, bench._run._input.fileno()
+    os.kill(run._process.pid, signal.SIGSTOP)
+    failures = []
+
+    def write_for_ever() -> None:
+        try:
+            while True:
+                run.send("halt")
+        except RunFailed as failure:
+            failures.append(failure.code)
+
+    os.set_blocking(pipe, False)
+    try:
+        while True:
+            os.write(pipe, b"\n" * 4096)
+    except BlockingIOError:
+        os.set_blocking(pipe, True)
+    writer = threading.Thread(target=write_for_ever, daemon=True)
+    if is_writing:
+        writer.start()
+        time.sleep(0.1)
+    began = time.monotonic()
+    bench.end(check=False)
+    assert time.monotonic() - began < 5
+    assert bench.exit_code == -9
+    if is_writing:
+        writer.join(5)
+        assert failures == [-9]
+    assert run._input.closed
+
+
+def test_a_run_ends_although_a_fork_of_this_process_has_its_input(fake: Bench) -> None:
+    assert fake._run is not None
+    copy = os.dup(fake._run._input.fileno())
+    try:
+        assert fake.end()["outcome"] == "done"
+    finally:
+        os.close(copy)
 
 
 def test_a_silent_run_ends_after_its_time(monkeypatch: pytest.MonkeyPatch) -> None:

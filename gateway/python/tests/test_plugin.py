@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from skinbus.pytest_plugin import _file_name
+
 FAKE = Path(__file__).parent / "fake"
 
 
@@ -63,7 +65,10 @@ def test_a_failed_test_leaves_its_recording_and_names_it(pytester: pytest.Pytest
     result = pytester.runpytest()
     result.assert_outcomes(passed=1, failed=1)
     kept = list(pytester.path.rglob("*.mcap"))
-    assert [path.name for path in kept] == ["test_a_failed_test_leaves_its_recording_and_names_it.py-test_press-4.mcap"]
+    assert len(kept) == 1
+    assert re.fullmatch(
+        r"test_a_failed_test_leaves_its_recording_and_names_it\.py-test_press-4-[0-9a-f]{8}\.mcap", kept[0].name
+    )
     assert kept[0].read_text() == "recording"
     result.stdout.fnmatch_lines(["*- skinbus recording -*", str(kept[0]), "*- skinbus messages -*", "a note"])
     # The same test passes: its old recording goes.
@@ -81,6 +86,32 @@ def test_a_failed_test_leaves_its_recording_and_names_it(pytester: pytest.Pytest
     assert not list(pytester.path.rglob("*.mcap"))
 
 
+def test_recordings_of_tests_with_similar_names_are_apart(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(
+        """
+        import pytest
+
+        # The test "a-b" passes, and must not remove the recording of "a b".
+        @pytest.mark.parametrize("name", ["a b", "a-b", "c"], ids=["a b", "a-b", "c" * 300])
+        @pytest.mark.skin("few.toml")
+        def test_press(bench, name):
+            assert name == "a-b"
+        """
+    )
+    pytester.runpytest().assert_outcomes(passed=1, failed=2)
+    kept = sorted(path.name for path in pytester.path.rglob("*.mcap"))
+    assert len(kept) == 2
+    assert all(len(name) < 150 for name in kept)
+
+
+@pytest.mark.parametrize("test", ["test_x.py::test_" + "ö" * 300, "test_x.py::test_" + "触" * 300, "\udc80" * 300, ""])
+def test_names_of_recordings_are_short_in_bytes(test: str) -> None:
+    name = _file_name(test)
+    assert len(f"{name}.mcap".encode()) < 150
+    assert re.search(r"-[0-9a-f]{8}$", name)
+    assert _file_name(test + "-") != name
+
+
 def test_options_name_a_skin_and_a_folder(pytester: pytest.Pytester) -> None:
     pytester.makeini("[pytest]\nskinbus_skin = skins/few.toml\nskinbus_recordings = failed")
     pytester.makepyfile(
@@ -92,7 +123,9 @@ def test_options_name_a_skin_and_a_folder(pytester: pytest.Pytester) -> None:
     )
     result = pytester.runpytest("-p", "no:cacheprovider")
     result.assert_outcomes(failed=1)
-    result.stdout.re_match_lines([rf"{re.escape(str(pytester.path))}/failed/test_options.*-test_default\.mcap"])
+    result.stdout.re_match_lines(
+        [rf"{re.escape(str(pytester.path))}/failed/test_options.*-test_default-[0-9a-f]{{8}}\.mcap"]
+    )
     assert len(list((pytester.path / "failed").glob("*.mcap"))) == 1
 
 
@@ -135,7 +168,7 @@ def test_a_run_that_fails_at_its_end_is_an_error_of_the_test(
     result = pytester.runpytest()
     result.assert_outcomes(passed=2, failed=1, errors=1)
     result.stdout.fnmatch_lines(
-        ["*RunFailed: the robot was halted (exit code 3)", "*- skinbus recording -*", "*-test_error.mcap"]
+        ["*RunFailed: the robot was halted (exit code 3)", "*- skinbus recording -*", "*-test_error-????????.mcap"]
     )
     assert len(list(pytester.path.rglob("*.mcap"))) == 2
 
@@ -179,5 +212,5 @@ def test_benches_run_beside_each_other(pytester: pytest.Pytester) -> None:
     )
     result = pytester.runpytest_subprocess("-n", "4")
     result.assert_outcomes(passed=7, failed=1)
-    result.stdout.fnmatch_lines(["*- skinbus recording -*", "*test_press-8.mcap"])
+    result.stdout.fnmatch_lines(["*- skinbus recording -*", "*test_press-8-????????.mcap"])
     assert len(list(pytester.path.rglob("*.mcap"))) == 1

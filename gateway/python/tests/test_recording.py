@@ -5,9 +5,13 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import shutil
 import subprocess
+import sys
+import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +19,7 @@ import numpy as np
 import pytest
 
 import skinbus
+from skinbus import _recording_index
 from skinbus.recording import ReadFailed, Recording, read
 
 RECORDINGS = Path(__file__).parents[3] / "tests" / "recordings"
@@ -40,6 +45,14 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def copied(folder: Path, *names: str) -> list[Path]:
     return [Path(shutil.copy(RECORDINGS / name, folder)) for name in names]
+
+
+def wait_until(is_true: Callable[[], bool], limit: float = 20.0) -> None:
+    """Waits for a state."""
+    end = time.monotonic() + limit
+    while not is_true():
+        assert time.monotonic() < end
+        time.sleep(0.02)
 
 
 def attached_skin(recording: Path) -> bytes:
@@ -138,8 +151,16 @@ def test_parts_are_one_recording_in_any_order(tmp_path: Path) -> None:
     check_against_csv(recording, tmp_path / "torques.csv")
     assert len(recording.epochs()) == 150
     again = read(parts[1], parts[2], parts[0])
-    assert again.index == recording.index == tmp_path / "split-1.mcap+2.columns"
+    assert again.index == recording.index
+    assert re.fullmatch(r"split-1\.mcap\+2-[0-9a-f]{8}\.columns", recording.index.name)
     assert len(read(parts[0]).epochs()) < 150
+
+
+def test_captures_with_the_same_first_file_have_their_own_indexes(tmp_path: Path) -> None:
+    one, two, three = (tmp_path / name for name in ("a.mcap", "b.mcap", "c.mcap"))
+    names = {_recording_index._index_path(files) for files in ([one], [one, two], [one, three], [one, two, three])}
+    assert len(names) == 4
+    assert _recording_index._index_path([one, two]) == _recording_index._index_path([one, tmp_path / "." / "b.mcap"])
 
 
 def test_a_log_needs_a_skin(tmp_path: Path, demo: Path) -> None:
@@ -212,6 +233,106 @@ def test_the_index_is_used_again_until_the_file_changes(tmp_path: Path) -> None:
         read(file)
 
 
+@pytest.mark.parametrize("small", [0, 1 << 30])
+def test_an_open_recording_stays_when_its_index_is_replaced(
+    small: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_recording_index, "_SMALL_BYTES", small)
+    file, other = copied(tmp_path, "fd.mcap", "two.mcap")
+    expected, cells = read(other, index=False), [str(cell) for cell in read(other).cells]
+    recording = read(other)
+    shutil.copy(file, other)
+    assert read(other).index == recording.index
+    assert len(read(other).epochs()) != len(expected.epochs()) or read(other).cells != recording.cells
+    np.testing.assert_array_equal(recording.epochs().central, expected.epochs().central)
+    for cell in cells:
+        np.testing.assert_array_equal(recording.torques(cell).values, expected.torques(cell).values)
+
+
+def test_an_index_that_is_replaced_while_it_is_mapped_is_mapped_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, other = copied(tmp_path, "fd.mcap", "two.mcap")
+    place, next_one = read(file).index, read(other).index
+    count = len(list(place.glob("*.npy")))
+    load, replacements = _recording_index._load_column, [1, count + 5]
+
+    def replaced(column: Path) -> np.ndarray[Any, Any]:
+        loaded = load(column)
+        replacements[0] -= 1
+        if replacements[0] == 0:
+            place.rename(tmp_path / "old")
+            next_one.rename(place)
+            (tmp_path / "old").rename(next_one)
+            replacements.pop(0)
+            replacements.append(1 << 30)
+        return loaded
+
+    monkeypatch.setattr(_recording_index, "_load_column", replaced)
+    # Replaced in the first and the second attempt.
+    index = _recording_index.load_index(place)
+    assert index.description == json.loads((place / "columns.json").read_text())
+    assert set(index.columns) == {path.stem for path in place.glob("*.npy")}
+    for name, column in index.columns.items():
+        np.testing.assert_array_equal(column, np.load(place / f"{name}.npy"))
+    replacements[:] = [1, count, count]
+    with pytest.raises(ReadFailed, match="is replaced by other programs while it is read"):
+        _recording_index.load_index(place)
+
+
+def test_many_recordings_need_few_file_descriptors(tmp_path: Path) -> None:
+    (file,) = copied(tmp_path, "fd.mcap")
+    before = len(os.listdir("/proc/self/fd"))
+    recordings = [read(file) for _ in range(20)]
+    assert len(os.listdir("/proc/self/fd")) - before < len(recordings)
+
+
+def test_an_index_of_another_version_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (file,) = copied(tmp_path, "fd.mcap")
+    place = read(file).index / "columns.json"
+    description = json.loads(place.read_text())
+    version = _recording_index.program_version()
+    assert description["program"] == version
+    # The program may be one with the format of an earlier version.
+    monkeypatch.setattr(_recording_index, "FORMAT_VERSION", description["skinbus_columns"])
+    made = place.stat().st_ino
+    read(file)
+    assert place.stat().st_ino == made
+    place.write_text(json.dumps(description | {"program": "0.0.1"}))
+    read(file)
+    assert json.loads(place.read_text()) == description
+    for key, value in {"program": "0.0.1", "skinbus_columns": 0}.items():
+        place.write_text(json.dumps(description | {key: value}))
+        monkeypatch.setattr(_recording_index, "program_version", lambda: None)
+        read(file)
+        assert json.loads(place.read_text()).get(key) == (value if key == "program" else description[key])
+
+
+def test_a_version_that_is_not_available_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SKINBUS_PROGRAMS", str(tmp_path))
+    assert _recording_index.program_version() is None
+    for text, expected in {"exit 1": None, "echo skinbus 7.8.9": "7.8.9", "echo another 1": None}.items():
+        folder = tmp_path / text.replace(" ", "-")
+        folder.mkdir()
+        (folder / "skinbus").write_text(f"#!/bin/sh\n{text}\n")
+        (folder / "skinbus").chmod(0o755)
+        monkeypatch.setenv("SKINBUS_PROGRAMS", str(folder))
+        assert _recording_index.program_version() == expected
+
+
+def test_a_damaged_index_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (file,) = copied(tmp_path, "fd.mcap")
+    index = read(file).index
+    description = json.loads((index / "columns.json").read_text())
+    monkeypatch.setattr(_recording_index, "FORMAT_VERSION", description["skinbus_columns"])
+    for damage in (b"", b"\x93NUMPY\x01\0"):
+        (index / "frames.id.npy").write_bytes(damage)
+        assert len(read(file).frames().id) == 431
+    (index / "frames.id.npy").unlink()
+    with pytest.raises(ReadFailed, match=r"lacks frames.id.npy: remove this folder"):
+        read(file).frames()
+
+
 def test_an_interrupted_conversion_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (file,) = copied(tmp_path, "fd.mcap")
 
@@ -235,14 +356,30 @@ def test_notes_of_the_conversion_are_logged(tmp_path: Path, caplog: pytest.LogCa
 def test_without_an_index_nothing_stays(tmp_path: Path) -> None:
     (file,) = copied(tmp_path, "fd.mcap")
     with read(file, index=False) as recording:
+        assert not recording.index.parent.exists()
         epochs = recording.epochs()
-        folder = recording.index
-        assert folder.exists()
-    assert not folder.exists()
-    assert not folder.parent.exists()
+    with pytest.raises(ValueError, match="the recording is closed"):
+        recording.epochs()
     assert len(epochs) == 100
     assert np.any(epochs.central != 0), "arrays in use stay valid"
     assert os.listdir(tmp_path) == ["fd.mcap"]
+
+
+def test_without_an_index_nothing_stays_of_a_process_that_is_killed(tmp_path: Path) -> None:
+    (file,) = copied(tmp_path, "fd.mcap")
+    temporary, programs = tmp_path / "temporary", tmp_path / "programs"
+    temporary.mkdir()
+    programs.mkdir()
+    # A conversion that lasts.
+    (programs / "skinbus").write_text('#!/bin/sh\nfor place; do :; done\nmkdir "$place"; exec sleep 2\n')
+    (programs / "skinbus").chmod(0o755)
+    environment = os.environ | {"TMPDIR": str(temporary), "SKINBUS_PROGRAMS": str(programs)}
+    script = f"import skinbus; skinbus.read({str(file)!r}, index=False)"
+    process = subprocess.Popen([sys.executable, "-c", script], env=environment)
+    wait_until(lambda: list(temporary.glob("skinbus-*/recording.columns")) != [])
+    process.kill()
+    process.wait()
+    wait_until(lambda: os.listdir(temporary) == [])
 
 
 def test_the_index_of_a_folder_that_is_not_writable_is_in_the_cache(

@@ -24,7 +24,7 @@ class FrameFilter:
     """The filters of a connection, each once.
 
     Attributes:
-        is_for_server: Whether the server can filter. It takes at most 512 filters; with more it passes all frames, and
+        is_for_server: Tells if the server can filter. It takes at most 512 filters; with more it passes all frames, and
             `passes` decides.
     """
 

@@ -23,13 +23,16 @@ class PrivateFolder:
     A shell makes it, and waits for the end of a pipe whose other end this process has, and hands to the processes that
     use the folder. So it removes the folder after the last of them, even if SIGKILL ended this process.
 
+    Args:
+        for_sockets: Make it in /tmp if the usual place has a path too long for sockets.
+
     Raises:
         OSError: The folder cannot be made.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, for_sockets: bool = True) -> None:
         root = tempfile.gettempdir()
-        if len(os.fsencode(root)) > _MAX_ROOT:
+        if for_sockets and len(os.fsencode(root)) > _MAX_ROOT:
             root = "/tmp"
         reader, self._writer = os.pipe()
         self._is_open = True

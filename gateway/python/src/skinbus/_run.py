@@ -6,6 +6,7 @@ import contextlib
 import itertools
 import json
 import os
+import select
 import signal
 import subprocess
 import threading
@@ -62,13 +63,8 @@ class Run:
             reader.start()
 
     @property
-    def pid(self) -> int:
-        """Process id of the program."""
-        return self._process.pid
-
-    @property
     def has_ended(self) -> bool:
-        """Whether the program sends no more events."""
+        """Tells if the program sends no more events."""
         with self._changed:
             return self._has_ended
 
@@ -168,8 +164,10 @@ class Run:
         with self._sending:
             start = self.count
             try:
-                self._input.write(line)
-                self._input.flush()
+                # Without a buffer, which `end` would have to write.
+                descriptor = self._input.fileno()
+                while line:
+                    line = line[os.write(descriptor, line) :]
             except (BrokenPipeError, ValueError):
                 # A closed pipe, by the program or by `end`.
                 self._wait_for_readers()
@@ -188,36 +186,52 @@ class Run:
         return RunFailed(text.strip(), code, notes)
 
     def end(self, timeout: float) -> int:
-        """Ends the run in order, or with signals after `timeout` seconds. Returns its exit code."""
-        with self._sending, contextlib.suppress(OSError, ValueError):
-            self._input.write(b'{"do":"end"}\n')
-            self._input.flush()
-        with self._sending, contextlib.suppress(OSError, ValueError):
-            self._input.close()
+        """Ends the run in order, or with signals after `timeout` seconds. Returns its exit code.
+
+        A program that is stopped and reads no more commands is ended by the signals, too.
+        """
+        deadline = time.monotonic() + timeout
+        self._end_input(timeout, b'{"do":"end"}\n')
         for number in (signal.SIGTERM, signal.SIGKILL):
             try:
-                self._process.wait(timeout)
+                self._process.wait(max(0.0, deadline - time.monotonic()))
                 break
             except subprocess.TimeoutExpired:
-                timeout = _SIGNAL_TIMEOUT
-                self._signal(number)
+                deadline = time.monotonic() + _SIGNAL_TIMEOUT
+                self._process.send_signal(number)
+        return self._finish()
+
+    def kill(self) -> int:
+        """Ends the program at once, and returns its exit code. Its cells end when their parent does."""
+        self._process.kill()
+        return self._finish()
+
+    def _finish(self) -> int:
+        """Waits for the end of the program and of its output. Returns its exit code."""
         code = self._process.wait()
+        self._end_input(_SIGNAL_TIMEOUT)
         self._wait_for_readers()
         return code
 
-    def kill(self) -> None:
-        """Ends the program and its cells at once."""
-        self._signal(signal.SIGKILL)
-        self._process.wait()
-        self._wait_for_readers()
+    def _end_input(self, timeout: float, last: bytes = b"") -> None:
+        """Writes a last line and closes the input, unless commands fill the pipe for `timeout` seconds.
 
-    def _signal(self, number: signal.Signals) -> None:
-        """Signals the program; with SIGKILL also its cells, which are in its group."""
-        with contextlib.suppress(ProcessLookupError):
-            if number == signal.SIGKILL:
-                os.killpg(self._process.pid, number)
-            else:
-                self._process.send_signal(number)
+        The line is for programs that this process has forked: they hold the pipe open.
+        """
+        deadline = time.monotonic() + timeout
+        if not self._sending.acquire(timeout=timeout):
+            return
+        try:
+            if last and not self._input.closed:
+                poll = select.poll()
+                poll.register(self._input, select.POLLOUT)
+                # A pipe that can be written takes a short line at once.
+                if poll.poll(max(0.0, deadline - time.monotonic()) * 1000):
+                    with contextlib.suppress(BrokenPipeError):
+                        os.write(self._input.fileno(), last)
+            self._input.close()
+        finally:
+            self._sending.release()
 
     def _wait_for_readers(self) -> None:
         """Waits until everything that the program sent is read, unless another process holds its output open."""

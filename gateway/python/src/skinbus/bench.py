@@ -49,7 +49,7 @@ class Bench:
         skin: The skin's file.
         scenario: The scenario's file: touches, motion, faults.
         spawn: False: real cells, or cells of other processes, are on the bus; none are started.
-        duration: Time in s after which the run ends by itself; by default it goes on until `end`.
+        duration: Time in s after which the run ends by itself; by default it goes on until `end`, at most 24 h.
         record: A file to record to, as MCAP; it must not exist.
         directory: The directory of embedded buses; by default a private one, and without `spawn` that of other programs
             (`SKINBUS_DIR`).
@@ -164,8 +164,9 @@ class Bench:
         with contextlib.ExitStack() as stack:
             stack.callback(self._close_folder)
             if self._run is not None and self._code is None:
+                # The code if Ctrl-C interrupts `kill`. A program that ended before has its own.
                 self._code = -9
-                self._run.kill()
+                self._code = self._run.kill()
 
     def _close_folder(self) -> None:
         """Removes the private folder, unless another object owns it."""
@@ -245,7 +246,7 @@ class Bench:
             newton: The force in N, 0 to 90.
             confirm: Wait until a torque of the cell shows the force; otherwise use `Press.wait`. A press that the cell
                 does not answer is repeated twice, because a busy machine delays frames. On a bus whose cells answer
-                with sums, no press can be confirmed.
+                with sums, no press can be confirmed, nor can 0 N of a cell that is not touched: use `release`.
 
         Raises:
             Unconfirmed: No torque shows the force; `reason` and `text` say why.
@@ -280,7 +281,7 @@ class Bench:
                 press.wait()
                 break
             except Unconfirmed as error:
-                if error.reason == "not-touched":
+                if do == "release" and error.reason == "not-touched":
                     break
                 if is_last or error.reason != "no-answer":
                     raise
@@ -409,15 +410,15 @@ class Bench:
     def _epochs(self) -> Iterator[int]:
         """Requests an event for every epoch. Yields the number of the first event."""
         with self._counting:
-            self._counters += 1
             start = self._command("epochs", every=1).index
+            self._counters += 1
         try:
             yield start
         finally:
             with self._counting:
                 self._counters -= 1
                 if self._counters == 0:
-                    with contextlib.suppress(RunFailed):
+                    with contextlib.suppress(RunFailed, CommandRefused, TimeoutError):
                         self._command("epochs", every=0)
 
     @overload

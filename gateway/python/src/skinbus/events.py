@@ -168,6 +168,11 @@ class BusReport:
     up: bool
     halted: bool
     epoch: int | None = None
+    """Present epoch; None before the first joints."""
+    number: int = 0
+    """Number of the bus's joints so far, which counts on beyond 255."""
+    dropped_frames: int = 0
+    """Frames that the channel to this program read too late."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,6 +191,7 @@ class Lateness:
     """Lateness of the loop's ticks in µs."""
 
     p50: float = 0.0
+    p90: float = 0.0
     p99: float = 0.0
     max: float = 0.0
 

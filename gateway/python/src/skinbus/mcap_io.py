@@ -184,8 +184,9 @@ def _records_of_chunk(records: bytes) -> Iterator[tuple[int, int, int]]:
 class McapWriter(BinaryIOMessageWriter):
     """A writer of recordings.
 
-    The file is called `NAME.part` until `stop`, and then replaces a file of its name. What is older than a second
-    survives if the program is killed: `skinbus recover NAME.part -o NAME`.
+    The file is called `NAME.part` until `stop`, and then replaces a file of its name. A frame that comes more
+    than a second after the last writing writes all frames so far. Those survive if the program is killed: `skinbus
+    recover NAME.part -o NAME`. Frames before a silence of the bus are written by the next frame, or by `stop`.
     """
 
     def __init__(
@@ -317,7 +318,7 @@ class _Bus:
     Attributes:
         name: Its name.
         encoder: The encoder for its frames.
-        has_micros: Whether all times so far are whole microseconds.
+        has_micros: Tells if all times so far are whole microseconds.
         channel: The channel for its frames; None before the first one.
     """
 

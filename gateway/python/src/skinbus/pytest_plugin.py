@@ -11,6 +11,7 @@ The bench of a failed test leaves its recording in the folder of the option `ski
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import re
 import shutil
 from collections.abc import Generator, Iterator, Mapping
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 # The number of lines of the run's standard error in a report.
 _NOTES = 40
+# The last bytes of a test's name that are in the name of its recording.
+_NAME_BYTES = 120
 
 
 @dataclass
@@ -159,9 +162,14 @@ def _kept_path(request: pytest.FixtureRequest) -> Path:
         folder = cache.mkdir("skinbus")
     else:
         folder = request.config.rootpath / ".pytest_cache" / "d" / "skinbus"
-    # Names of files have at most 255 bytes.
-    name = re.sub(r"[^\w.-]+", "-", request.node.nodeid).strip("-")[-120:]
-    return folder / f"{name}.mcap"
+    return folder / f"{_file_name(request.node.nodeid)}.mcap"
+
+
+def _file_name(test: str) -> str:
+    """Returns a name of at most 255 bytes for the files of a test, which no other test has."""
+    digits = hashlib.sha256(test.encode(errors="backslashreplace")).hexdigest()[:8]
+    readable = re.sub(r"[^\w.-]+", "-", test).strip("-").encode()[-_NAME_BYTES:].decode(errors="ignore")
+    return f"{readable}-{digits}"
 
 
 def _configuration_folder(config: pytest.Config) -> Path:

@@ -6,16 +6,15 @@
     recording.epochs().to_pandas()           # as `skinbus convert run.mcap torques.csv`
 
 The first call converts the recording into an index beside it, `run.mcap.columns`, in about the time of
-`skinbus convert`. Later calls map that index into memory and read only what is used.
+`skinbus convert`. Later calls map that index into memory and read only what is used, until the recording or the version
+of `skinbus` changes.
 """
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
-import shutil
-import tempfile
-import weakref
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +24,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skinbus._recording_index import ReadFailed, convert, load_description, open_index
+from skinbus._folder import PrivateFolder
+from skinbus._recording_index import Index, ReadFailed, convert, load_index, open_index
 from skinbus._recording_tables import Contacts, Epochs, Frames, Joints, Notes, Sums, Torques
 
 if TYPE_CHECKING:
@@ -127,7 +127,8 @@ def read(*files: PathLike, skin: PathLike | None = None, index: bool = True) -> 
         files: The files of one capture, in any order.
         skin: The skin file. A recording has its own skin; a log needs one.
         index: Keep the converted recording beside the file, as `FILE.columns`, and use it the next time. If the folder
-            is not writable, it is kept in the user's cache. False: convert into a temporary folder.
+            is not writable, it is kept in the user's cache. False: convert into a temporary folder, which is removed
+            whatever happens; its disk space is free when the recording and its arrays are no longer used.
 
     Raises:
         ReadFailed: The files are not one capture, the capture does not fit the skin, or the index cannot be written.
@@ -141,16 +142,11 @@ def read(*files: PathLike, skin: PathLike | None = None, index: bool = True) -> 
     for path in [*paths, *([skin_path] if skin_path else [])]:
         path.stat()
     if index:
-        place, description = open_index(paths, skin_path)
-        return Recording(place, description)
-    folder = Path(tempfile.mkdtemp(prefix="skinbus-"))
-    try:
-        place = folder / "recording.columns"
-        convert(paths, place, skin_path)
-        return Recording(place, load_description(place), temporary=folder)
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
+        return Recording(open_index(paths, skin_path))
+    with contextlib.closing(PrivateFolder(for_sockets=False)) as folder:
+        place = folder.path / "recording.columns"
+        convert(paths, place, skin_path, descriptors=[folder.descriptor])
+        return Recording(load_index(place))
 
 
 class Recording:
@@ -160,7 +156,7 @@ class Recording:
     or by its node id alone if only one bus has cells.
 
     Attributes:
-        index: The folder of the converted recording.
+        index: The folder of the converted recording; with `index=False` it was removed.
         skin: The name of the skin.
         robot: The name of the robot.
         began_ns: The time from which commands count seconds: the first tick of the run, else the first frame.
@@ -174,11 +170,13 @@ class Recording:
         metadata: The metadata records of the recording.
     """
 
-    def __init__(self, index: Path, description: Mapping[str, Any], temporary: Path | None = None) -> None:
-        self.index = index
+    def __init__(self, index: Index) -> None:
+        description = index.description
+        self.index = index.path
         self._tables: Mapping[str, Any] = description["tables"]
         self._buses: list[dict[str, Any]] = description["buses"]
-        self._columns: dict[str, NDArray[Any]] = {}
+        self._columns = dict(index.columns)
+        self._is_open = True
         self._in_order: dict[tuple[str, int, int], bool] = {}
         self.skin: str = description["skin"]
         self.robot: str = description["robot"]
@@ -201,7 +199,6 @@ class Recording:
             table: {(it["bus"], it["node"]): (it["begin"], it["end"]) for it in facts.get("groups", ())}
             for table, facts in self._tables.items()
         }
-        self._remove = weakref.finalize(self, shutil.rmtree, temporary, ignore_errors=True) if temporary else None
 
     def __repr__(self) -> str:
         return f"<Recording {self.index}: {self.accounts.frames} frames, {self.accounts.epochs} epochs>"
@@ -215,10 +212,9 @@ class Recording:
         self.close()
 
     def close(self) -> None:
-        """Removes a temporary folder. Arrays that are in use stay valid."""
+        """Releases the tables; later calls of methods raise ValueError. Arrays that are in use stay valid."""
+        self._is_open = False
         self._columns.clear()
-        if self._remove is not None:
-            self._remove()
 
     def frames(self, start_ns: int | None = None, end_ns: int | None = None, bus: str | None = None) -> Frames:
         """Returns the frames of all buses, or of one."""
@@ -309,13 +305,13 @@ class Recording:
         return self.epochs().to_pandas()
 
     def _column(self, table: str, name: str) -> NDArray[Any]:
-        """Returns a column, mapped into memory when it is first used."""
-        key = f"{table}.{name}"
-        if key not in self._columns:
-            mapped: NDArray[Any] = np.load(self.index / f"{key}.npy", mmap_mode="r", allow_pickle=False)
-            # Slices of a plain array are much faster than those of a memmap.
-            self._columns[key] = mapped.view(np.ndarray)
-        return self._columns[key]
+        """Returns a column."""
+        if not self._is_open:
+            raise ValueError("the recording is closed")
+        column = self._columns.get(f"{table}.{name}")
+        if column is None:
+            raise ReadFailed(f"{self.index} lacks {table}.{name}.npy: remove this folder, and read the recording again")
+        return column
 
     def _group_rows(self, table: str, group: tuple[int, int], start_ns: int | None, end_ns: int | None) -> Rows:
         return self._rows(table, self._groups[table].get(group, (0, 0)), start_ns, end_ns)
