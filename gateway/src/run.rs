@@ -67,10 +67,6 @@ struct CommonOptions {
     /// Address of the page [default: any free port of this machine]
     #[arg(long, value_name = "ADDRESS:PORT", requires = "view")]
     listen: Option<SocketAddr>,
-    /// Read commands from standard input and write events to standard output, for a program that presses cells;
-    /// docs/reference/control.md describes them. The run ends at the end of the input, and without --duration only then
-    #[arg(long)]
-    control: bool,
     #[command(flatten)]
     recording: RecordingArguments,
 }
@@ -205,6 +201,11 @@ pub(crate) struct RunCommand {
     candump: Option<PathBuf>,
     #[command(flatten)]
     kinds: BusKinds,
+    /// Read commands from standard input and write events to standard output, for a program that presses cells;
+    /// docs/reference/control.md describes them. The run ends at the end of the input, or after --duration [default: a
+    /// day]
+    #[arg(long)]
+    control: bool,
     /// Start no cells: real ones, or ones that run already, are on the bus
     #[arg(long)]
     no_spawn: bool,
@@ -232,7 +233,7 @@ impl DemoCommand {
         let skin = Skin::parse("the demonstration's skin", DEMO_SKIN_TOML).map_err(Failure::usage_error)?;
         let scenario = Scenario::parse("the demonstration's scenario", DEMO_SCENARIO_TOML, &skin)
             .map_err(Failure::usage_error)?;
-        let mut options = self.common.options(skin_file, skin, scenario);
+        let mut options = self.common.options(skin_file, skin, scenario, false);
         options.cells_per_process = cells_per_process()?;
         options.kinds = self
             .kinds
@@ -250,7 +251,7 @@ impl DemoCommand {
         options
             .announced
             .push(format!("to see the decoded frames: {place}skinbus dump vcan0 --bus-kind {kind}"));
-        let CommonOptions { recording, summary, verbose, view, listen, control, .. } = self.common;
+        let CommonOptions { recording, summary, verbose, view, listen, .. } = self.common;
         let numbered = self.candump.is_none();
         let path = self.candump.unwrap_or_else(|| DEMO_LOG.into());
         let candump = Some(CandumpOutput { path, numbered });
@@ -265,7 +266,7 @@ impl DemoCommand {
         };
         options.record = recording.options(candump, files, &[]);
         let page = view.then(|| PageProcess::start(&options, listen, &PageOptions::default())).transpose()?;
-        let remotes = RunRemotes { page, is_controlled: control };
+        let remotes = RunRemotes { page, is_controlled: false };
         run_bench(&options, (summary.as_deref(), recording.overwrite), verbose, &[], remotes)
     }
 }
@@ -301,8 +302,8 @@ impl RunCommand {
         for remark in scenario.warnings(&skin) {
             print_note(format_args!("remark: {remark}"));
         }
-        let mut options = self.common.options(skin_file, skin, scenario);
-        let CommonOptions { recording, summary, verbose, view, listen, control, .. } = self.common;
+        let mut options = self.common.options(skin_file, skin, scenario, self.control);
+        let CommonOptions { recording, summary, verbose, view, listen, .. } = self.common;
         options.kinds = self.kinds.kinds_of_buses(bus_names(&options.skin))?;
         let candump = self.candump.map(|path| CandumpOutput { path, numbered: false });
         let files = RunTexts { skin: skin_text, scenario: scenario_text, robot };
@@ -315,7 +316,7 @@ impl RunCommand {
         options.receive_buffer = bytes.unwrap_or(GATEWAY_RECEIVE_BUFFER_BYTES) as usize;
         options.cells_per_process = self.processes.cells_per_process.into();
         let page = view.then(|| PageProcess::start(&options, listen, &self.page)).transpose()?;
-        let remotes = RunRemotes { page, is_controlled: control };
+        let remotes = RunRemotes { page, is_controlled: self.control };
         run_bench(&options, (summary.as_deref(), recording.overwrite), verbose, &read, remotes)
     }
 }
@@ -342,8 +343,14 @@ fn emulated(
 
 impl CommonOptions {
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 1e13: checked")]
-    fn options(&self, skin_file: PathBuf, skin: Skin, mut scenario: Scenario) -> RunOptions {
-        let until_stopped = (self.view || self.control).then_some(MAX_VIEW_DURATION_S);
+    fn options(
+        &self,
+        skin_file: PathBuf,
+        skin: Skin,
+        mut scenario: Scenario,
+        is_controlled: bool,
+    ) -> RunOptions {
+        let until_stopped = (self.view || is_controlled).then_some(MAX_VIEW_DURATION_S);
         if let Some(seconds) = self.duration.or(until_stopped) {
             scenario.duration = Span((seconds * 1e6) as u64);
         }

@@ -10,6 +10,7 @@ use bench::run::RunOptions;
 use bench::summary::Summary;
 use protocol::bus::embedded::default_directory;
 use protocol::usage::Failure;
+use rustix::io::ioctl_fionbio;
 use view::control::ControlEvent;
 use view::control::channel::{ChannelOptions, ControlChannel};
 
@@ -43,6 +44,9 @@ pub(super) fn start_channel(options: &RunOptions) -> Result<(ControlChannel, Rem
     // The handles of the standard library lock and buffer each line.
     let output = File::from(io::stdout().as_fd().try_clone_to_owned().map_err(failure)?);
     let input: Stdin = io::stdin();
+    // Non-blocking streams would seem to have ended. Kinds of files that cannot be switched do not block.
+    let _ = ioctl_fionbio(&input, false);
+    let _ = ioctl_fionbio(&output, false);
     let (channel, lines) = ControlChannel::start(channel, input, output).map_err(failure)?;
     Ok((channel, Remote { name: "control", lines, ends_run: true }))
 }
@@ -54,18 +58,18 @@ pub(super) fn end_channel(
     done: Result<(), Failure>,
 ) -> Result<(), Failure> {
     let Some(channel) = channel else { return done };
+    let channel = channel.stop();
+    let done = match done {
+        Ok(()) if channel.has_failed => Err(Failure::run_error("--control: a thread of the channel failed")),
+        done => done,
+    };
     let (code, text) = match &done {
         Ok(()) => (0, None),
         Err(failure) => (failure.code(), Some(failure.to_string())),
     };
     let summary = summary.and_then(|summary| serde_json::to_value(summary).ok());
-    let is_read = channel.finish(&ControlEvent::Ended { code, text, summary });
-    match done {
-        Ok(()) if !is_read => Err(Failure::run_error(
-            "--control: the last events were not read within 5 s; read standard output to its end",
-        )),
-        done => done,
-    }
+    let read = channel.finish(&ControlEvent::Ended { code, text, summary });
+    done.and_then(|()| read.map_err(|unread| Failure::run_error(format!("--control: {unread}"))))
 }
 
 fn failure(error: io::Error) -> Failure {

@@ -20,8 +20,8 @@ use crate::lock_ignoring_poison;
 const RECEIVE_TIMEOUT: Duration = Duration::from_millis(50);
 /// The size of the receive buffer of a bus in bytes.
 const RECEIVE_BUFFER_BYTES: usize = 8 << 20;
-/// The value of `read_to` while no frames wait to be read.
-const ALL_FRAMES_READ: u64 = u64::MAX;
+/// The time after a step for which its thread may be late before time stands still, in µs.
+const MAX_STEP_DELAY_US: u64 = 300_000;
 
 /// A bus that a thread follows, and on which other threads send.
 #[derive(Debug)]
@@ -29,8 +29,7 @@ pub(crate) struct FollowedBus {
     name: String,
     format: Format,
     bus: Mutex<Option<Arc<Bus>>>,
-    /// The time of the last frame that was read, in µs, while more frames wait to be read; otherwise
-    /// [`ALL_FRAMES_READ`].
+    /// The time in µs up to which all frames have been applied, or are about to be.
     read_to: AtomicU64,
 }
 
@@ -90,7 +89,7 @@ impl FollowedBus {
             name: described.name.clone(),
             format: described.format,
             bus: Mutex::new(bus),
-            read_to: AtomicU64::new(ALL_FRAMES_READ),
+            read_to: AtomicU64::new(u64::MAX),
         })
     }
 
@@ -112,23 +111,21 @@ impl FollowedBus {
             }
             // If the batch was full, more frames may be waiting to be read.
             let last = follower.frames().last().filter(|_| follower.frames().len() == MAX_BATCH_DATAGRAMS);
-            let read_to = last.map_or(ALL_FRAMES_READ, |last| last.at_nanos / 1_000);
-            self.read_to.store(read_to, Ordering::Relaxed);
+            let read_to = last.map_or_else(|| now().0 + MAX_STEP_DELAY_US, |last| last.at_nanos / 1_000);
             apply(&mut follower);
+            self.read_to.store(read_to, Ordering::Relaxed);
         }
     }
 
-    /// Sends a message. A failure counts as a lost frame.
-    pub(crate) fn send_or_lose(&self, message: &Message) {
+    /// Sends a message. Returns false if the bus does not take it; it then counts as a lost frame.
+    pub(crate) fn send(&self, message: &Message) -> bool {
         let bus = lock_ignoring_poison(&self.bus).clone();
-        if let Some(bus) = bus {
-            let _ = send_message(&bus, message, self.format);
-        }
+        bus.is_some_and(|bus| send_message(&bus, message, self.format).is_ok())
     }
 }
 
-/// Returns the present time. While frames wait to be read, time ends at the last frame that was read, so that no cell
-/// seems silent.
+/// Returns the present time. While frames wait to be read, or a thread has no processor time, time ends at the last
+/// frame that was read, so that no cell seems silent.
 pub(crate) fn time_of_read_frames(buses: &[FollowedBus]) -> Micros {
     let read_to = buses.iter().map(|bus| Micros(bus.read_to.load(Ordering::Relaxed))).min();
     read_to.map_or_else(now, |read_to| now().min(read_to))

@@ -176,7 +176,7 @@ fn publish_and_execute(
             let page = SensorPage::Skin(sensors);
             let message = Message::Stimulus { to: Node::Cell(node), from: StimulusStart::Next, page };
             if let Some(bus) = buses.get(bus) {
-                bus.send_or_lose(&message);
+                let _ = bus.send(&message);
             }
         }
         next = (next + SNAPSHOT_INTERVAL).max(Instant::now());
@@ -195,7 +195,7 @@ fn execute_command(
     pressed: &mut TouchRegistry,
     buses: &[FollowedBus],
 ) {
-    let everywhere = |message: &Message| buses.iter().for_each(|bus| bus.send_or_lose(message));
+    let everywhere = |message: &Message| buses.iter().for_each(|bus| _ = bus.send(message));
     match *command {
         Command::Press { bus, node, force_n } => match live.pressable_cell(bus, node) {
             Some(cell) => pressed.press(page, cell, force_n),

@@ -108,7 +108,9 @@ fn an_unconfirmed_press_has_its_reason() {
     run.wait_for("resumed", |_| true);
     run.send(&json!({"do": "bus", "bus": "vcan0", "down": true}));
     run.wait_for("bus", |event| event["up"] == false);
-    assert_eq!(reason(&outcome(&mut run, 6, 1.0)), "dead");
+    run.send(&json!({"do": "press", "cell": 6, "force_n": 1, "id": 99}));
+    let error = run.wait_for("error", |event| event["id"] == 99);
+    assert_eq!(error["text"], "cell vcan0:6: no joints come on vcan0: wait for the bus, or bring it up");
     let (last, status, stderr) = run.end();
     // The loop halts the robot while its only bus is down.
     assert_eq!((last["code"].as_u64(), status.code()), (Some(3), Some(3)), "{stderr}");

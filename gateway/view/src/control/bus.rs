@@ -25,7 +25,7 @@ const ROWS_OF_MAX_J_ERROR: u8 = 6;
 pub(super) struct ControlBus {
     live: LiveBus,
     cells: Vec<ControlledCell>,
-    /// The number of joints on the bus, which is the number of the present epoch.
+    /// The number of the present epoch: its byte, continued beyond 255.
     number: u64,
     presses: PendingPresses,
     /// The time since which the bus is lost without an event. The buses of a run are also lost at its end.
@@ -92,7 +92,7 @@ impl ControlBus {
 
     /// Returns true if joints and a heartbeat of each cell were received.
     pub(super) fn is_complete(&self) -> bool {
-        self.number > 0 && self.live.table.cells().iter().all(|cell| cell.heartbeat().is_some())
+        self.live.current.is_some() && self.live.table.cells().iter().all(|cell| cell.heartbeat().is_some())
     }
 
     /// Returns true if an epoch is complete, so that its torques are known.
@@ -127,20 +127,32 @@ impl ControlBus {
         }
         self.handle_notices(at, events);
         match message {
-            Some(Message::Joints { .. }) => {
+            Some(Message::Joints { epoch, .. }) => {
+                // Joints that did not arrive have epochs, too. Cells ignore joints that repeat an epoch.
+                let passed = self.live.previous.map(|previous| epoch.0.wrapping_sub(previous.epoch.0));
+                if passed == Some(0) {
+                    return Vec::new();
+                }
                 let ended = self.live.previous.filter(|_| every > 0 && self.number.is_multiple_of(every));
                 events.extend(ended.map(|ended| self.epoch_event(&ended, at_ns)));
-                self.number += 1;
+                self.number = match passed {
+                    Some(passed) => self.number + u64::from(passed),
+                    None => first_number(self.number, epoch),
+                };
                 return self.presses.begin_epoch(self.number, at);
             }
             Some(Message::Torque { from, epoch, torque }) => {
                 self.handle_torque(from, epoch, &torque, at_ns, events)
             }
-            Some(Message::Network { from, epoch, page: NetworkPage::Heartbeat(beat) }) if self.live.sums => {
+            Some(Message::Network { from, epoch, page: NetworkPage::Heartbeat(beat) }) => {
                 if let Node::Cell(cell) = from
                     && let Some(place) = self.live.table.index_of(cell)
                 {
-                    self.set_touched(place, beat.state.has(State::ACTIVE), epoch, at_ns, events);
+                    // The torque that ended a contact may be lost; torques begin contacts, except on buses with sums.
+                    let is_active = beat.state.has(State::ACTIVE);
+                    if self.live.sums || !is_active {
+                        self.set_touched(place, is_active, epoch, at_ns, events);
+                    }
                 }
             }
             Some(_) | None => {}
@@ -196,8 +208,9 @@ impl ControlBus {
         if !words.as_slice().iter().zip(&expected).all(is_near) {
             return self.presses.note(from, press.first, UnconfirmedReason::OtherTorque);
         }
-        if is_zero && f_z > 0.0 {
-            return self.presses.note(from, press.first, UnconfirmedReason::NoTorque);
+        if is_zero != (f_z <= 0.0) {
+            let reason = if is_zero { UnconfirmedReason::NoTorque } else { UnconfirmedReason::OtherTorque };
+            return self.presses.note(from, press.first, reason);
         }
         self.presses.remove(from, press.first);
         let joints = self.live.joint_torques().count();
@@ -298,7 +311,7 @@ impl ControlBus {
         &self,
         id: Option<RequestId>,
         cell: CellId,
-        (force_n, sensors): (f64, SkinSensors),
+        (is_press, force_n, sensors): (bool, f64, SkinSensors),
         at: Micros,
     ) -> Press {
         let place = self.live.table.index_of(cell);
@@ -308,9 +321,12 @@ impl ControlBus {
             Some(UnconfirmedReason::Measuring)
         } else {
             let force = place.map_or(0.0, |place| self.live.central.cell_force(place, &sensors));
-            (force_n > 0.0 && force <= 0.0).then_some(UnconfirmedReason::BelowThreshold)
+            (is_press && force <= 0.0).then_some(UnconfirmedReason::BelowThreshold)
         };
-        Press { id, cell, force_n, sensors, first: self.presses.first_epoch(cell, self.number), at, hidden }
+        let is_touched = place.and_then(|place| self.cells.get(place)).is_some_and(|cell| cell.is_touched);
+        let must_answer = is_press || is_touched || self.presses.is_pressing(cell);
+        let first = self.presses.first_epoch(cell, self.number);
+        Press { id, cell, force_n, sensors, first, at, hidden, must_answer }
     }
 
     /// Adds a press. Returns it if its stimulus is to be sent now.
@@ -364,6 +380,8 @@ impl ControlBus {
             events.extend(loss.into_iter().chain([true]).map(|up| self.bus_event(up)));
         } else if was_up && !is_up {
             self.lost_since = Some(now);
+            // Epochs pass meanwhile: no stimulus can name one before the next joints.
+            (self.live.current, self.live.previous) = (None, None);
         }
     }
 
@@ -403,4 +421,14 @@ impl ControlBus {
     fn cell_text(&self, node: CellId) -> String {
         format!("{}:{node}", self.live.name)
     }
+}
+
+/// Returns the number of the first epoch on a bus, or after a loss of it: the epoch's byte, continued from `former`. How
+/// many epochs have passed is unknown then: too many for the presses before it.
+fn first_number(former: u64, epoch: Epoch) -> u64 {
+    if former == 0 {
+        return epoch.0.into();
+    }
+    let least = former + 256;
+    least + u64::from(epoch.0.wrapping_sub(least.to_le_bytes()[0]))
 }

@@ -1,6 +1,7 @@
 //! The threads of a control channel: one reads commands, one writes events, one for each bus receives, and one serves
 //! them all.
 
+use std::collections::BTreeMap;
 use std::io::{self, BufReader, Read, Write};
 use std::os::unix::net::UnixStream;
 use std::path::PathBuf;
@@ -18,7 +19,7 @@ use protocol::message::Message;
 use protocol::skin::Skin;
 
 use super::event::ControlEvent;
-use super::queue::EventQueue;
+use super::queue::{EventQueue, UnreadEvents};
 use super::request::{InputLine, read_line};
 use super::state::{ControlOutput, ControlState};
 use crate::followed::{BusOpener, FollowedBus, time_of_read_frames};
@@ -62,6 +63,25 @@ pub struct ControlChannel {
     stop: Arc<AtomicBool>,
 }
 
+/// A channel after its run, before the last event.
+#[derive(Debug)]
+pub struct StoppedChannel {
+    events: Arc<EventQueue>,
+    /// True if a thread of the channel failed, so that commands may be unanswered.
+    pub has_failed: bool,
+}
+
+/// Stops the channel if its thread panics: it would answer wrongly without it.
+struct StopOnPanic<'a>(&'a AtomicBool);
+
+impl Drop for StopOnPanic<'_> {
+    fn drop(&mut self) {
+        if thread::panicking() {
+            self.0.store(true, Ordering::Relaxed);
+        }
+    }
+}
+
 impl ControlChannel {
     /// Starts a channel that reads commands from `input` and writes events to `output`. Returns it with the connection
     /// for the run.
@@ -93,13 +113,26 @@ impl ControlChannel {
         Ok((Self { events, lines, serving, stop }, there))
     }
 
-    /// Ends the channel after the run, with the last event. Returns false if the events were not read.
-    pub fn finish(self, last: &ControlEvent) -> bool {
+    /// Stops the channel after the run, and answers the commands that are still under way.
+    #[must_use]
+    pub fn stop(self) -> StoppedChannel {
         self.stop.store(true, Ordering::Relaxed);
-        if let Ok(mut state) = self.serving.join() {
+        let state = self.serving.join();
+        let has_failed = state.is_err();
+        if let Ok(mut state) = state {
             state.handle_end(lock_ignoring_poison(&self.lines).try_iter().flatten());
             state.take_output().events.iter().for_each(|event| self.events.push(event));
         }
+        StoppedChannel { events: self.events, has_failed }
+    }
+}
+
+impl StoppedChannel {
+    /// Sends the last event.
+    ///
+    /// # Errors
+    /// Returns the reason why the events were not read to their end.
+    pub fn finish(self, last: &ControlEvent) -> Result<(), UnreadEvents> {
         self.events.finish(last, LAST_EVENT_TIMEOUT)
     }
 }
@@ -135,6 +168,7 @@ fn serve(
         for (index, bus) in buses.iter().enumerate() {
             let (shared, buses) = (&shared, &buses);
             let receive = move || {
+                let _guard = StopOnPanic(stop);
                 bus.receive(opener, FRAME_GATHER_TIME, stop, |follower| {
                     let mut state = lock_ignoring_poison(shared);
                     follower.for_each_item(|item| {
@@ -148,12 +182,11 @@ fn serve(
                     send_messages(buses, &messages);
                 });
             };
-            if thread::Builder::new().spawn_scoped(scope, receive).is_err() {
-                // Without this bus the channel would answer wrongly: end it, and so the run.
-                stop.store(true, Ordering::Relaxed);
-            }
+            // Without this bus the channel would answer wrongly: a failure ends it, and so the run.
+            thread::Builder::new().spawn_scoped(scope, receive).expect("a thread for each bus");
         }
-        Server { run, lines, events, shared: &shared, buses: &buses, unsent: Vec::new() }.serve(stop);
+        let (shared, buses, unsent_halts) = (&shared, &buses, BTreeMap::new());
+        Server { run, lines, events, shared, buses, unsent: Vec::new(), unsent_halts }.serve(stop);
     });
     shared.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner)
 }
@@ -167,6 +200,8 @@ struct Server<'a> {
     buses: &'a [FollowedBus],
     /// Commands that did not fit into the pipe to the run.
     unsent: Vec<BenchCommand>,
+    /// For each bus that did not take it, the last halt or resume.
+    unsent_halts: BTreeMap<usize, Message>,
 }
 
 impl Server<'_> {
@@ -198,13 +233,26 @@ impl Server<'_> {
             }
             let ControlOutput { messages, commands, .. } = push_events(&mut state, self.events);
             drop(state);
-            send_messages(self.buses, &messages);
+            self.send(&messages);
             self.unsent.extend(commands);
             let run = &mut self.run;
             let sent = self.unsent.iter().take_while(|command| run.send(command)).count();
             self.unsent.drain(..sent);
         }
         stop.store(true, Ordering::Relaxed);
+    }
+
+    /// Sends messages. A halt or resume is repeated until its bus takes it.
+    fn send(&mut self, messages: &[(usize, Message)]) {
+        let retried = std::mem::take(&mut self.unsent_halts);
+        let is_replaced = |bus: usize| messages.iter().any(|(of, it)| *of == bus && is_halt_or_resume(it));
+        let retried = retried.into_iter().filter(|(bus, _)| !is_replaced(*bus));
+        for (bus, message) in retried.chain(messages.iter().copied()) {
+            let is_sent = self.buses.get(bus).is_some_and(|bus| bus.send(&message));
+            if !is_sent && is_halt_or_resume(&message) {
+                self.unsent_halts.insert(bus, message);
+            }
+        }
     }
 
     fn next_line(&self) -> Result<Input, RecvTimeoutError> {
@@ -219,10 +267,15 @@ fn push_events(state: &mut ControlState, events: &EventQueue) -> ControlOutput {
     output
 }
 
+const fn is_halt_or_resume(message: &Message) -> bool {
+    matches!(message, Message::Halt | Message::Resume)
+}
+
+/// Sends stimuli. A press whose stimulus is lost is not confirmed.
 fn send_messages(buses: &[FollowedBus], messages: &[(usize, Message)]) {
     for (bus, message) in messages {
         if let Some(bus) = buses.get(*bus) {
-            bus.send_or_lose(message);
+            let _ = bus.send(message);
         }
     }
 }

@@ -120,7 +120,7 @@ pub enum ControlEvent {
         bus: String,
         /// The epoch.
         epoch: u8,
-        /// The number of the epoch, counted from the first one that was received on the bus.
+        /// The number of the epoch: its byte, continued beyond 255.
         number: u64,
         /// The time stamp of the joints that ended the epoch in ns since 1970.
         at_ns: u64,
@@ -138,7 +138,7 @@ pub enum ControlEvent {
         /// Positions and torques, by joint of the robot.
         #[serde(flatten)]
         joints: JointTorques,
-        /// The cells that are not quiet.
+        /// The cells that have sent a torque or are not quiet.
         cells: Vec<ReportedCell>,
         /// Lateness of all ticks up to the last full second in µs; `None` in the first second.
         lateness_us: Option<Quantiles>,

@@ -20,5 +20,5 @@ pub mod request;
 mod state;
 
 pub use event::ControlEvent;
-pub use queue::EventQueue;
+pub use queue::{EventQueue, UnreadEvents};
 pub use state::{ControlOutput, ControlState};

@@ -42,6 +42,8 @@ pub(super) struct Press {
     pub(super) at: Micros,
     /// The reason why no torque can show the press, if it is known from the start.
     pub(super) hidden: Option<UnconfirmedReason>,
+    /// True if the cell must answer: it is pressed, or was in contact before its release.
+    pub(super) must_answer: bool,
 }
 
 /// A press that was sent, with what is known of its effect.
@@ -121,6 +123,13 @@ impl PendingPresses {
             sent.press.cell == cell && epoch >= sent.press.first && !is_replaced
         })
         .map(|sent| &sent.press)
+    }
+
+    /// Returns true if a force on a cell is under way.
+    pub(super) fn is_pressing(&self, cell: CellId) -> bool {
+        let mut sent = self.sent.iter().map(|sent| &sent.press).filter(|press| press.cell == cell);
+        let latest = self.held.get(&cell).or_else(|| sent.next_back());
+        latest.is_some_and(|press| press.hidden.is_none() && press.force_n > 0.0)
     }
 
     /// Removes a press that a torque has shown, or that cannot be shown.
@@ -205,10 +214,10 @@ impl SentPress {
     fn unanswered_reason(&self) -> UnconfirmedReason {
         if self.last() < self.press.first + ANSWER_EPOCHS - 1 {
             UnconfirmedReason::Superseded
-        } else if self.press.force_n <= 0.0 {
-            UnconfirmedReason::NotTouched
-        } else {
+        } else if self.press.must_answer {
             UnconfirmedReason::NoAnswer
+        } else {
+            UnconfirmedReason::NotTouched
         }
     }
 }
@@ -226,7 +235,16 @@ mod tests {
     fn press(presses: &PendingPresses, number: i64, force_n: f64, now: u64) -> Press {
         let (id, first) = (Some(RequestId::Number(number.into())), presses.first_epoch(cell(), now));
         let sensors = SkinSensors::default();
-        Press { id, cell: cell(), force_n, sensors, first, at: Micros(now * 16_000), hidden: None }
+        Press {
+            id,
+            cell: cell(),
+            force_n,
+            sensors,
+            first,
+            at: Micros(now * 16_000),
+            hidden: None,
+            must_answer: force_n > 0.0,
+        }
     }
 
     fn number(press: &Press) -> i64 {

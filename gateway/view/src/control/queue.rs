@@ -20,6 +20,17 @@ pub struct EventQueue {
     changed: Condvar,
 }
 
+/// The reason why the last events were not read.
+#[derive(Clone, Copy, Debug, Eq, PartialEq, thiserror::Error)]
+pub enum UnreadEvents {
+    /// The reader took too long.
+    #[error("the last events were not read within {} s: read standard output to its end", .0.as_secs())]
+    Slow(Duration),
+    /// The reader closed its end, or the output failed.
+    #[error("standard output was closed before the last event")]
+    Closed,
+}
+
 #[derive(Debug, Default)]
 struct WaitingLines {
     lines: VecDeque<Vec<u8>>,
@@ -52,9 +63,11 @@ impl EventQueue {
         self.changed.notify_all();
     }
 
-    /// Adds the last event, which is never dropped, and waits at most `timeout` until all events are written. Returns
-    /// true if they are.
-    pub fn finish(&self, event: &ControlEvent, timeout: Duration) -> bool {
+    /// Adds the last event, which is never dropped, and waits at most `timeout` until all events are written.
+    ///
+    /// # Errors
+    /// Returns the reason why they are not.
+    pub fn finish(&self, event: &ControlEvent, timeout: Duration) -> Result<(), UnreadEvents> {
         let until = Instant::now() + timeout;
         let mut waiting = self.lock();
         waiting.add_dropped_count();
@@ -64,20 +77,14 @@ impl EventQueue {
         while waiting.bytes > 0 && !waiting.is_closed {
             let left = until.saturating_duration_since(Instant::now());
             if left.is_zero() {
-                return false;
+                return Err(UnreadEvents::Slow(timeout));
             }
             waiting = match self.changed.wait_timeout(waiting, left) {
                 Ok((waiting, _)) => waiting,
                 Err(poisoned) => poisoned.into_inner().0,
             };
         }
-        !waiting.is_closed
-    }
-
-    /// Returns true if the reader has closed its end.
-    #[must_use]
-    pub fn is_closed(&self) -> bool {
-        self.lock().is_closed
+        if waiting.is_closed { Err(UnreadEvents::Closed) } else { Ok(()) }
     }
 
     /// Writes the events as they come, until the last one is written or the reader has closed its end.
@@ -167,7 +174,7 @@ mod tests {
             reader.read_to_string(&mut text).unwrap();
             text
         });
-        assert!(queue.finish(&bus_event(false), Duration::from_secs(10)));
+        queue.finish(&bus_event(false), Duration::from_secs(10)).unwrap();
         writing.join().unwrap();
         let text = reading.join().unwrap();
         let lines: Vec<_> = text.lines().collect();
@@ -181,7 +188,8 @@ mod tests {
     fn a_reader_that_sleeps_or_has_gone_holds_nothing_up() {
         let queue = EventQueue::default();
         queue.push(&bus_event(true));
-        assert!(!queue.finish(&bus_event(false), Duration::from_millis(10)), "it is not read");
+        let slow = queue.finish(&bus_event(false), Duration::from_millis(10));
+        assert_eq!(slow, Err(UnreadEvents::Slow(Duration::from_millis(10))));
 
         struct Gone;
         impl Write for Gone {
@@ -195,8 +203,7 @@ mod tests {
         let queue = EventQueue::default();
         queue.push(&bus_event(true));
         queue.write_to(&mut Gone);
-        assert!(queue.is_closed());
         queue.push(&bus_event(true));
-        assert!(!queue.finish(&bus_event(false), Duration::from_secs(10)));
+        assert_eq!(queue.finish(&bus_event(false), Duration::from_secs(10)), Err(UnreadEvents::Closed));
     }
 }

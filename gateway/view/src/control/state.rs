@@ -390,20 +390,20 @@ impl ControlState {
         &mut self,
         (now, id, command): (Micros, Option<RequestId>, &'static str),
         (index, node): (usize, CellId),
-        force_n: f64,
+        asked_n: f64,
     ) -> Result<(), String> {
         let name = self.cell_text(index, node);
         let Some(bus) = self.buses.get_mut(index) else { return Ok(()) };
         if bus.epoch().is_none() {
             return Err(format!(
-                "cell {name}: no joints were received on {} yet: wait for the bus",
+                "cell {name}: no joints come on {}: wait for the bus, or bring it up",
                 bus.name()
             ));
         }
-        let contact = contact_words(force_n);
+        let contact = contact_words(asked_n);
         let sensors = SkinSensors { contact, ..bus.latched_sensors(node, now).unwrap_or_default() };
         let force_n = contact.iter().map(|word| word.to_f64()).sum();
-        let press = bus.new_press(id.clone(), node, (force_n, sensors), now);
+        let press = bus.new_press(id.clone(), node, (asked_n > 0.0, force_n, sensors), now);
         let epoch = bus.epoch_with_number(press.first).0;
         let stimulus_event = AskedStimulus { cell: name, force_n, epoch };
         let events = &mut self.output.events;

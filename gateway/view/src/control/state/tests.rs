@@ -1,8 +1,12 @@
 use super::*;
 use bench::remote::CommandReply;
+use model::central::CentralComputation;
 use model::testing::ONE_CELL_SKIN_TOML;
 use protocol::can::Format;
+use protocol::fixed::TorqueFormat;
 use protocol::message::{Heartbeat, Joints, NetworkPage, State};
+use protocol::packet::{Length, Words};
+use protocol::parameters::MAX_JOINTS;
 use serde_json::{Value, json};
 
 /// A controlled run of one cell, whose bus the test plays.
@@ -51,6 +55,33 @@ impl Played {
         let page = NetworkPage::Heartbeat(Heartbeat { state, ..Heartbeat::default() });
         let from = Node::Cell(CellId::new(1).unwrap());
         self.receive(&Message::Network { from, epoch: Epoch(self.epoch), page });
+    }
+
+    /// Sends the torque that the cell computes with a force in an epoch.
+    fn answer_joints(&mut self, epoch: u8, force_n: f64) {
+        let central = CentralComputation::new(&self.state.skin);
+        let frames = central.link_frames(&[Default::default(); MAX_JOINTS]);
+        let mut torque = Words::zeros(Length::Six);
+        for (word, expected) in torque.as_mut_slice().iter_mut().zip(central.cell_torque(0, &frames, force_n))
+        {
+            *word = TorqueFormat::Q3_12.nearest_word(expected);
+        }
+        self.receive(&Message::Torque { from: CellId::new(1).unwrap(), epoch: Epoch(epoch), torque });
+    }
+
+    /// Returns the outcomes of presses so far, each with its id and its epoch or reason.
+    fn outcomes(&mut self) -> Vec<(u64, Value)> {
+        let events = self.events().into_iter();
+        events
+            .filter_map(|event| {
+                let outcome = match event["event"].as_str()? {
+                    "confirmed" => event["epoch"].clone(),
+                    "unconfirmed" => event["reason"].clone(),
+                    _ => return None,
+                };
+                Some((event["id"].as_u64()?, outcome))
+            })
+            .collect()
     }
 
     fn line(&mut self, line: &Value) -> Vec<Value> {
@@ -140,4 +171,76 @@ fn the_end_of_the_input_ends_the_run_after_its_commands() {
     played.answer(&[(1, true, "kill"), (2, true, "end the run")]);
     let last = played.events().pop();
     assert_eq!(last, Some(json!({"event": "error", "id": 2, "text": "the run is ending"})));
+}
+
+#[test]
+fn a_press_is_confirmed_by_its_epoch_also_if_joints_were_lost() {
+    let mut played = Played::ready();
+    played.line(&json!({"do": "press", "cell": 1, "force_n": 3, "id": 1}));
+    // The joints of the next epoch do not arrive here.
+    played.epoch += 1;
+    played.begin_epoch();
+    let epoch = played.epoch;
+    played.answer_joints(epoch, 3.0);
+    assert_eq!(played.outcomes(), [(1, json!(epoch))]);
+    // Repeated joints are no epoch.
+    played.line(&json!({"do": "press", "cell": 1, "force_n": 5, "id": 2}));
+    played.epoch -= 1;
+    played.begin_epoch();
+    played.begin_epoch();
+    played.answer_joints(epoch + 1, 3.0);
+    assert_eq!(played.outcomes(), [], "the force is asked for later");
+    played.begin_epoch();
+    played.answer_joints(epoch + 2, 5.0);
+    assert_eq!(played.outcomes(), [(2, json!(epoch + 2))]);
+}
+
+#[test]
+fn a_release_is_shown_by_zeros_and_a_touched_cell_has_to_send_them() {
+    let mut played = Played::ready();
+    played.line(&json!({"do": "release", "cell": 1, "id": 1}));
+    (0..6).for_each(|_| played.begin_epoch());
+    played.beat();
+    assert_eq!(played.outcomes(), [(1, json!("not-touched"))]);
+    played.line(&json!({"do": "press", "cell": 1, "force_n": 3, "id": 2}));
+    played.begin_epoch();
+    played.line(&json!({"do": "release", "cell": 1, "id": 3}));
+    played.begin_epoch();
+    played.answer_joints(played.epoch, 3.0);
+    assert_eq!(played.outcomes(), [(2, json!(played.epoch))]);
+    // The torque of zeros is lost.
+    for _ in 0..30 {
+        played.begin_epoch();
+        played.beat();
+    }
+    assert_eq!(played.outcomes(), [], "it may come late");
+    for _ in 0..15 {
+        played.begin_epoch();
+        played.beat();
+    }
+    assert_eq!(played.outcomes(), [(3, json!("no-answer"))]);
+}
+
+#[test]
+fn a_force_that_rounds_to_nothing_is_below_the_threshold() {
+    let mut played = Played::ready();
+    played.line(&json!({"do": "press", "cell": 1, "force_n": 0.0004, "id": 1}));
+    (0..5).for_each(|_| played.begin_epoch());
+    assert_eq!(played.outcomes(), [(1, json!("below-threshold"))]);
+}
+
+#[test]
+fn no_stimulus_names_an_epoch_from_before_a_loss_of_the_bus() {
+    let mut played = Played::ready();
+    played.state.handle_bus_state(played.now(), 0, true, 0);
+    played.state.handle_bus_state(played.now(), 0, false, 0);
+    played.state.output.messages.clear();
+    let events = played.line(&json!({"do": "press", "cell": 1, "force_n": 1, "id": 1}));
+    assert_eq!(events.last().unwrap()["event"], "error", "{events:?}");
+    assert_eq!(played.state.output.messages, []);
+    played.state.handle_bus_state(played.now(), 0, true, 0);
+    played.epoch += 100;
+    played.begin_epoch();
+    let events = played.line(&json!({"do": "press", "cell": 1, "force_n": 1, "id": 2}));
+    assert_eq!(events.last().unwrap()["epoch"], played.epoch + 2, "{events:?}");
 }
