@@ -3,7 +3,7 @@
 use std::io::Write;
 use std::path::Path;
 
-use analysis::explain::series::{EpochSeriesError, EpochTorque, for_each_epoch, is_summed};
+use analysis::explain::series::{EpochSeriesError, EpochTorque, for_each_epoch};
 use csv::{Writer, WriterBuilder};
 use protocol::skin::{Skin, SkinReply};
 use trace::capture::{Reader, seconds_since};
@@ -22,8 +22,7 @@ pub(super) fn write_torque_rows(
     skin: &Skin,
     out: impl Write,
 ) -> Result<(u64, LossCounts), EpochSeriesError<csv::Error>> {
-    let summed = (0..skin.robot.joints.len()).map(|joint| is_summed(skin, joint)).collect();
-    let mut rows = TorqueRows { summed, out: WriterBuilder::new().from_writer(out) };
+    let mut rows = TorqueRows { out: WriterBuilder::new().from_writer(out) };
     rows.out.write_record(csv_header(skin)).map_err(EpochSeriesError::Consumer)?;
     let mut missing = LossCounts::default();
     let done =
@@ -62,26 +61,18 @@ fn format_number(value: f64) -> String {
 }
 
 struct TorqueRows<W: Write> {
-    /// True for each joint whose chain belongs to a bus with sums.
-    summed: Vec<bool>,
     out: Writer<W>,
 }
 
 impl<W: Write> TorqueRows<W> {
     /// Writes a row with the torques that `skinbus explain` shows. Seconds count from `zero`, in ns since 1970.
     fn write_row(&mut self, zero: u64, epoch: &EpochTorque) -> Result<(), csv::Error> {
-        let EpochTorque { at_ns, epoch, positions, explanation, .. } = epoch;
+        let EpochTorque { at_ns, epoch, positions, torques, explanation, .. } = epoch;
         let seconds = seconds_since(zero, *at_ns);
         let mut row = vec![format!("{seconds:.9}"), epoch.to_string()];
-        let joints = positions.iter().zip(&explanation.total).zip(&self.summed);
-        for ((position, total), summed) in joints {
-            let of_words = |value: f64| if *summed { String::new() } else { format_number(value) };
-            row.extend([
-                position.map_or_else(String::new, format_number),
-                of_words(total.words_nm),
-                format_number(total.central_nm),
-                of_words(total.difference_nm),
-            ]);
+        for (position, torque) in positions.iter().zip(torques) {
+            let numbers = [*position, torque.distributed, torque.central, torque.error];
+            row.extend(numbers.map(|number| number.map_or_else(String::new, format_number)));
         }
         let most = |count: fn(&analysis::explain::JointTorqueTotal) -> u32| {
             explanation.total.iter().map(count).max().unwrap_or_default().to_string()

@@ -154,6 +154,35 @@ fn torques_that_come_in_sums_are_empty_and_the_central_ones_are_there() {
 }
 
 #[test]
+fn torques_are_empty_in_an_epoch_that_a_bus_of_the_joint_lacks() {
+    let folder = folder(&["two.mcap"]);
+    said(&folder, "convert two.mcap two.log --direction", 0);
+    let log = fs::read_to_string(folder.path().join("two.log")).unwrap();
+    let is_joints = |line: &str, bus: &str| line.contains(&format!(" {bus} 001#"));
+    // In classic CAN, joints of six words have two frames.
+    let (first, second) = {
+        let mut frames = (0..).zip(log.lines()).filter(|(_, line)| is_joints(line, "vcan1")).skip(2 * 40);
+        (frames.next().unwrap().0, frames.next().unwrap().0)
+    };
+    let without = |is_left_out: &dyn Fn(usize, &str) -> bool| {
+        let lines = log.lines().enumerate().filter(|(at, line)| !is_left_out(*at, line));
+        let lines: String = lines.map(|(_, line)| format!("{line}\n")).collect();
+        fs::write(folder.path().join("part.log"), lines).unwrap();
+        gateway(folder.path(), "convert part.log part.csv --skin two.toml --overwrite");
+        rows(&folder, "part.csv")
+    };
+    let torques = ["distributed_joint2_Nm", "central_joint2_Nm", "error_joint2_Nm"];
+    let cut = without(&|at, _| at == first || at == second);
+    let empty: Vec<_> = cut.iter().filter(|row| torques.iter().any(|name| row[*name].is_empty())).collect();
+    assert_eq!((cut.len(), empty.len()), (100, 1));
+    assert!(torques.iter().all(|name| empty[0][*name].is_empty()), "{:?}", empty[0]);
+    assert!(!empty[0]["position_joint2_rad"].is_empty(), "vcan0 had the joints");
+    // A bus that is not in the capture changes nothing on joints that another one has.
+    let one = without(&|_, line| line.contains(" vcan1 "));
+    assert!(one.len() == 100 && one.iter().all(|row| torques.iter().all(|name| !row[*name].is_empty())));
+}
+
+#[test]
 fn what_has_no_torques_is_refused_in_one_line_and_nothing_is_written() {
     let folder = folder(&["fd.mcap", "classic.log", "two.mcap"]);
     fs::write(folder.path().join("foreign.log"), "(1.000001) can7 123#11\n").unwrap();

@@ -16,7 +16,7 @@ use super::contacts::ContactTable;
 use super::description::{ColumnOrigin, TableFacts, describe};
 use super::entries::{FrameTable, NoteTable};
 use crate::explain::JointsNotFound;
-use crate::explain::series::{EpochSeriesError, EpochTorque, SeriesObserver, is_summed, observe_epochs};
+use crate::explain::series::{EpochSeriesError, EpochTorque, KnownTorque, SeriesObserver, observe_epochs};
 
 /// The error of writing the columns of a capture.
 #[derive(Debug, Error)]
@@ -79,7 +79,6 @@ struct ColumnObserver<'a> {
     cells: HashSet<u32>,
     /// Number of joints of the longest chain.
     width: usize,
-    summed: Vec<bool>,
     accounts: Accounts,
     first_ns: Option<u64>,
     frames: FrameTable,
@@ -133,7 +132,6 @@ impl<'a> ColumnObserver<'a> {
             skin,
             cells: skin.cells.iter().map(|cell| cell_group(cell.bus, cell.node)).collect(),
             width,
-            summed: (0..robot).map(|joint| is_summed(skin, joint)).collect(),
             accounts: Accounts::new(skin.buses.iter().map(|bus| bus.name.as_str())),
             first_ns: None,
             frames: FrameTable::create(folder)?,
@@ -216,8 +214,7 @@ impl SeriesObserver for ColumnObserver<'_> {
     }
 
     fn receive_epoch(&mut self, _: u64, epoch: &EpochTorque) -> io::Result<()> {
-        let EpochTorque { at_ns, epoch, number, positions, explanation } = epoch;
-        let total = &explanation.total;
+        let EpochTorque { at_ns, epoch, number, positions, torques, explanation } = epoch;
         let of_epoch = self.epochs.rows();
         for bus in &explanation.buses {
             let Some(index) = self.skin.bus_index(&bus.bus) else { continue };
@@ -226,16 +223,17 @@ impl SeriesObserver for ColumnObserver<'_> {
             self.row.numbers(bus.position_rad.iter().copied(), self.width);
             self.joints.push(u32::try_from(index).unwrap_or(u32::MAX >> 8) << 8, &self.row)?;
         }
-        let robot = self.summed.len();
+        let robot = self.skin.robot.joints.len();
+        let total = &explanation.total;
         let open = total.iter().map(|total| total.open).max().unwrap_or_default();
         let saturated = total.iter().map(|total| total.saturated).max().unwrap_or_default();
         self.row.clear().count(*at_ns).i64(*number).u8(*epoch).u32(open).u32(saturated);
         self.row.numbers(positions.iter().map(|position| position.unwrap_or(f64::NAN)), robot);
-        let of_words = |(value, summed): (f64, &bool)| if *summed { f64::NAN } else { value };
-        self.row.numbers(total.iter().map(|total| total.words_nm).zip(&self.summed).map(of_words), robot);
-        self.row.numbers(total.iter().map(|total| total.central_nm), robot);
-        self.row
-            .numbers(total.iter().map(|total| total.difference_nm).zip(&self.summed).map(of_words), robot);
+        let parts: [fn(&KnownTorque) -> Option<f64>; 3] =
+            [|torque| torque.distributed, |torque| torque.central, |torque| torque.error];
+        for part in parts {
+            self.row.numbers(torques.iter().map(|torque| part(torque).unwrap_or(f64::NAN)), robot);
+        }
         self.epochs.push(&self.row)?;
         self.contacts.receive_epoch(self.skin, explanation)
     }

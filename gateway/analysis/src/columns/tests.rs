@@ -200,3 +200,37 @@ fn frames_without_joints_have_no_epochs_and_notes_keep_their_texts() {
     assert_eq!((&accounts["lost"], &accounts["unreadable_lines"]), (&12.into(), &1.into()));
     assert_eq!(accounts["buses"][0]["lost"], 12);
 }
+
+/// The numbers of the five joints in each epoch.
+fn numbers(place: &Path, name: &str) -> Vec<[f64; 5]> {
+    let numbers: Vec<_> = column(place, name).into_iter().map(f64::from_le_bytes).collect();
+    numbers.chunks_exact(5).map(|row| row.try_into().unwrap()).collect()
+}
+
+#[test]
+fn torques_on_joints_whose_bus_sent_none_are_unknown() {
+    let place = tempfile::tempdir().unwrap();
+    let place = place.path().join("arms.columns");
+    let mut log = Log::default();
+    for epoch in 0..8_u8 {
+        let at = u64::from(epoch) * 16_000;
+        if epoch != 5 {
+            log.joints(at, "can0", epoch, 2);
+        }
+        log.joints(at + 10, "can1", epoch, 3);
+        log.torque(at + 500, "can1", 7, epoch, [4_096, 0, 0]);
+    }
+    assert_eq!(written(&log, &place)["tables"]["epochs"]["rows"], 8);
+    for (name, of_can1) in
+        [("positions", None), ("distributed", Some(1.0)), ("central", Some(0.0)), ("error", Some(1.0))]
+    {
+        for (epoch, row) in numbers(&place, &format!("epochs.{name}")).into_iter().enumerate() {
+            let unknown = row.map(f64::is_nan);
+            assert_eq!(unknown, [epoch == 5, epoch == 5, false, false, false], "{name} of epoch {epoch}");
+            assert!(
+                of_can1.is_none_or(|expected: f64| row[2].to_bits() == expected.to_bits()),
+                "{name}: {row:?}"
+            );
+        }
+    }
+}

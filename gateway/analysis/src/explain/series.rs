@@ -16,7 +16,7 @@ use trace::capture::{CaptureEntry, CaptureError, CaptureNote, Reader};
 
 use super::observed::ObservedJoints;
 use super::watch::JointsWatcher;
-use super::{Explainer, JointsNotFound, TorqueExplanation};
+use super::{Explainer, JointTorqueTotal, JointsNotFound, TorqueExplanation};
 
 /// Number of epochs that a bus may be behind the others before they no longer wait for it.
 const MAX_BUS_LAG_EPOCHS: i64 = 64;
@@ -32,8 +32,22 @@ pub struct EpochTorque {
     pub number: i64,
     /// The position of each joint of the robot in rad or m; `None` for a joint whose bus sent no joints in this epoch.
     pub positions: Vec<Option<f64>>,
+    /// The torques on each joint of the robot. They are unknown for a joint without a position, and if another bus with
+    /// cells on the joint had joints before and sent none in this epoch.
+    pub torques: Vec<KnownTorque>,
     /// The derivation of the torques.
     pub explanation: TorqueExplanation,
+}
+
+/// The torque of the skin on one joint in Nm or N, as far as it is known.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct KnownTorque {
+    /// The sum of the cells' words; `None` also if they answer with sums.
+    pub distributed: Option<f64>,
+    /// The central computation.
+    pub central: Option<f64>,
+    /// `distributed` less `central`.
+    pub error: Option<f64>,
 }
 
 /// The error of reading a capture epoch by epoch.
@@ -191,7 +205,7 @@ pub fn observe_epochs<O: SeriesObserver>(
 
 /// Returns true if the torques on a joint arrive in sums, so that the torques of single cells are not in the capture.
 #[must_use]
-pub fn is_summed(skin: &Skin, joint: usize) -> bool {
+pub(crate) fn is_summed(skin: &Skin, joint: usize) -> bool {
     let mut buses = skin.buses.iter().enumerate();
     buses.any(|(at, bus)| {
         bus.reply != SkinReply::Torque && skin.joints_on_bus(at).any(|(of_bus, _)| of_bus == joint)
@@ -203,6 +217,8 @@ struct EpochJoiner<'a> {
     skin: &'a Skin,
     watch: JointsWatcher<'a>,
     explainer: Explainer<'a>,
+    /// True for each joint of the robot whose torques arrive in sums.
+    summed: Vec<bool>,
     /// Epochs for which joints of some buses are still missing, by their number and then by bus.
     waiting: BTreeMap<i64, (Epoch, Vec<Option<ObservedJoints>>)>,
     /// The newest epoch number of each bus that has cells.
@@ -217,6 +233,7 @@ impl<'a> EpochJoiner<'a> {
             skin,
             watch: JointsWatcher::for_all_joints(skin),
             explainer: Explainer::new(skin),
+            summed: (0..skin.robot.joints.len()).map(|joint| is_summed(skin, joint)).collect(),
             waiting: BTreeMap::new(),
             last: with_cells.map(|bus| (bus, None)).collect(),
             newest: None,
@@ -263,7 +280,32 @@ impl<'a> EpochJoiner<'a> {
                 }
             }
         }
+        let torques = self.known_torques(&positions, &moments, &explanation.total);
         let at_ns = moments.iter().flatten().map(|moment| moment.at_ns).min().unwrap_or_default();
-        Some(EpochTorque { at_ns, epoch: epoch.0, number, positions, explanation })
+        Some(EpochTorque { at_ns, epoch: epoch.0, number, positions, torques, explanation })
+    }
+
+    /// Returns the torques that are known in an epoch, given the joints of each bus.
+    fn known_torques(
+        &self,
+        positions: &[Option<f64>],
+        moments: &[Option<ObservedJoints>],
+        total: &[JointTorqueTotal],
+    ) -> Vec<KnownTorque> {
+        let mut is_known: Vec<_> = positions.iter().map(Option::is_some).collect();
+        let buses = self.last.iter().filter(|(_, last)| last.is_some());
+        let without = buses.filter(|(bus, _)| moments.get(*bus).is_none_or(Option::is_none));
+        for (joint, _) in without.flat_map(|(bus, _)| self.skin.joints_on_bus(*bus)) {
+            if let Some(is_known) = is_known.get_mut(joint) {
+                *is_known = false;
+            }
+        }
+        let joints = total.iter().zip(&self.summed).zip(is_known);
+        let torques = joints.map(|((total, summed), is_known)| KnownTorque {
+            distributed: (is_known && !summed).then_some(total.words_nm),
+            central: is_known.then_some(total.central_nm),
+            error: (is_known && !summed).then_some(total.difference_nm),
+        });
+        torques.collect()
     }
 }

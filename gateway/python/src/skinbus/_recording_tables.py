@@ -235,9 +235,9 @@ class Epochs:
         open_cells: Number of cells whose word or contact state is unknown, [n].
         saturated_cells: Number of cells with a saturated word, [n].
         positions: The positions in rad or m; NaN where no bus had the joint, [n, joints of the robot].
-        distributed: The sums of the cells' words in Nm or N; NaN where cells answer with sums,
+        distributed: The sums of the cells' words in Nm or N; NaN where a bus had no joints, or cells answer with sums,
             [n, joints of the robot].
-        central: The central computation in Nm or N, [n, joints of the robot].
+        central: The central computation in Nm or N; NaN where a bus had no joints, [n, joints of the robot].
         error: `distributed` less `central`, [n, joints of the robot].
         names: The joints of the robot.
         units: The units of position and torque of each joint.
