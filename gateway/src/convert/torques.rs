@@ -74,10 +74,7 @@ impl<W: Write> TorqueRows<W> {
             let numbers = [*position, torque.distributed, torque.central, torque.error];
             row.extend(numbers.map(|number| number.map_or_else(String::new, format_number)));
         }
-        let most = |count: fn(&analysis::explain::JointTorqueTotal) -> u32| {
-            explanation.total.iter().map(count).max().unwrap_or_default().to_string()
-        };
-        row.extend([most(|total| total.open), most(|total| total.saturated)]);
+        row.extend([explanation.open_cells(), explanation.saturated_cells()].map(|cells| cells.to_string()));
         self.out.write_record(row)
     }
 }

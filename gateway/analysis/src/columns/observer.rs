@@ -224,10 +224,10 @@ impl SeriesObserver for ColumnObserver<'_> {
             self.joints.push(u32::try_from(index).unwrap_or(u32::MAX >> 8) << 8, &self.row)?;
         }
         let robot = self.skin.robot.joints.len();
-        let total = &explanation.total;
-        let open = total.iter().map(|total| total.open).max().unwrap_or_default();
-        let saturated = total.iter().map(|total| total.saturated).max().unwrap_or_default();
-        self.row.clear().count(*at_ns).i64(*number).u8(*epoch).u32(open).u32(saturated);
+        self.row.clear().count(*at_ns).i64(*number).u8(*epoch);
+        for cells in [explanation.open_cells(), explanation.saturated_cells()] {
+            self.row.u32(u32::try_from(cells).unwrap_or(u32::MAX));
+        }
         self.row.numbers(positions.iter().map(|position| position.unwrap_or(f64::NAN)), robot);
         let parts: [fn(&KnownTorque) -> Option<f64>; 3] =
             [|torque| torque.distributed, |torque| torque.central, |torque| torque.error];

@@ -234,3 +234,23 @@ fn torques_on_joints_whose_bus_sent_none_are_unknown() {
         }
     }
 }
+
+#[test]
+fn cells_are_counted_once_whatever_joints_they_move() {
+    let place = tempfile::tempdir().unwrap();
+    let place = place.path().join("arms.columns");
+    let mut log = Log::default();
+    for epoch in 0..3_u8 {
+        let at = u64::from(epoch) * 16_000;
+        log.joints(at, "can0", epoch, 2);
+        log.joints(at + 10, "can1", epoch, 3);
+    }
+    log.torque(16_500, "can0", 1, 1, [4, i16::MAX, 0]);
+    log.torque(16_510, "can1", 7, 1, [i16::MIN, 5, i16::MAX]);
+    log.torque(32_500, "can1", 7, 2, [i16::MIN, 5, 6]);
+    written(&log, &place);
+    let counts = |name| column(&place, name).into_iter().map(u32::from_le_bytes).collect::<Vec<_>>();
+    // The contact states are unknown.
+    assert_eq!(counts("epochs.open_cells"), [0, 2, 1]);
+    assert_eq!(counts("epochs.saturated_cells"), [0, 2, 1]);
+}

@@ -47,6 +47,23 @@ pub struct TorqueExplanation {
     pub missing: Vec<String>,
 }
 
+impl TorqueExplanation {
+    /// Returns the number of cells with an unknown word or force. If above zero, the sums cannot be compared.
+    #[must_use]
+    pub fn open_cells(&self) -> usize {
+        let is_open = |cell: &&CellExplanation| cell.force.is_none() || cell.answered_after_ns.is_none();
+        self.cells.iter().filter(is_open).count()
+    }
+
+    /// Returns the number of cells with a saturated word, which make the sums inexact.
+    #[must_use]
+    pub fn saturated_cells(&self) -> usize {
+        let has_saturated =
+            |cell: &&CellExplanation| cell.rows.iter().any(|row| row.word.is_some_and(is_saturated));
+        self.cells.iter().filter(has_saturated).count()
+    }
+}
+
 /// The explanation of one joint broadcast on a bus, with the torques of all its cells.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct BusExplanation {
