@@ -20,8 +20,8 @@ struct OpenContact {
 }
 
 /// The table of contacts. A contact begins with the first joints at which the cell's force is above its threshold, and
-/// ends with the first ones at which it is not. If the force is unknown, an answer counts as contact, because cells
-/// without contact do not answer.
+/// ends with the first ones at which it is not. If the force is unknown, an answer counts as contact unless all its
+/// words are zero: a cell answers once with zeros when its contact has ended, and then no more.
 #[derive(Debug)]
 pub(super) struct ContactTable {
     table: GroupedTable,
@@ -47,8 +47,8 @@ impl ContactTable {
         let buses: Vec<_> =
             buses.filter_map(|bus| Some((&bus.bus, skin.bus_index(&bus.bus)?, bus.at_ns))).collect();
         for cell in &explanation.cells {
-            let is_active =
-                cell.force.map_or_else(|| cell.answered_after_ns.is_some(), |force| force.force_steps > 0);
+            let has_torque = || cell.rows.iter().any(|row| row.word.is_some_and(|word| word != 0));
+            let is_active = cell.force.map_or_else(has_torque, |force| force.force_steps > 0);
             let bus = buses.iter().find(|(name, ..)| **name == cell.bus).filter(|_| is_active);
             let (Some(&(_, bus, at_ns)), Ok(node)) = (bus, CellId::new(cell.node.into())) else { continue };
             let contact = self.open.entry(cell_group(bus, node)).or_insert(OpenContact {

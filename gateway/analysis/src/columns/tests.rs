@@ -254,3 +254,23 @@ fn cells_are_counted_once_whatever_joints_they_move() {
     assert_eq!(counts("epochs.open_cells"), [0, 2, 1]);
     assert_eq!(counts("epochs.saturated_cells"), [0, 2, 1]);
 }
+
+#[test]
+fn an_answer_of_zeros_ends_a_contact_of_unknown_force() {
+    let place = tempfile::tempdir().unwrap();
+    let place = place.path().join("arms.columns");
+    let mut log = Log::default();
+    for epoch in 0..9_u8 {
+        let at = u64::from(epoch) * 16_000;
+        log.joints(at, "can1", epoch, 3);
+        match epoch {
+            2 | 3 => log.torque(at + 500, "can1", 7, epoch, [0, -1, 0]),
+            4 | 6 => log.torque(at + 500, "can1", 7, epoch, [0; 3]),
+            _ => {}
+        }
+    }
+    assert_eq!(written(&log, &place)["tables"]["contacts"]["rows"], 1);
+    let times = ["begin_ns", "end_ns"].map(|name| integers(&place, &format!("contacts.{name}")));
+    assert_eq!(times.map(|times| (times[0] - 1_000_000_000_000) / 16_000_000), [2, 4]);
+    assert_eq!(column::<1>(&place, "contacts.ended"), [[1]]);
+}
