@@ -274,3 +274,21 @@ fn an_answer_of_zeros_ends_a_contact_of_unknown_force() {
     assert_eq!(times.map(|times| (times[0] - 1_000_000_000_000) / 16_000_000), [2, 4]);
     assert_eq!(column::<1>(&place, "contacts.ended"), [[1]]);
 }
+
+#[test]
+fn numbers_of_epochs_go_on_by_the_time_after_a_gap() {
+    let place = tempfile::tempdir().unwrap();
+    let place = place.path().join("arms.columns");
+    let mut log = Log::default();
+    // 62.5 Hz: 312 epochs in 5 s, then 40 within a turn of 256, then 700, with the clock a little off.
+    let expected: Vec<i64> = [0, 1, 2, 314, 315, 355, 356, 1_056, 1_057].into();
+    for number in &expected {
+        let (epoch, at) = (number.to_le_bytes()[0], number.cast_unsigned() * 16_100);
+        log.joints(at, "can0", epoch, 2);
+        log.joints(at + 10, "can1", epoch, 3);
+    }
+    // A clock that is set back leaves only the epochs.
+    log.joints(90_000, "can0", 1_058_u16.to_le_bytes()[0], 2);
+    written(&log, &place);
+    assert_eq!(integers(&place, "epochs.number"), [expected, vec![1_058]].concat());
+}

@@ -1,7 +1,7 @@
 //! The torques of every epoch of a capture, each computed as in [`explain`](super::explain).
 //!
 //! Buses carry the joints of an epoch one after the other. They are joined by epoch number, which is continued beyond
-//! 255.
+//! 255; after a gap, by the time that has passed.
 
 use std::collections::BTreeMap;
 
@@ -212,6 +212,31 @@ pub(crate) fn is_summed(skin: &Skin, joint: usize) -> bool {
     })
 }
 
+/// The newest epoch of all buses.
+#[derive(Clone, Copy, Debug)]
+struct NewestEpoch {
+    number: i64,
+    epoch: Epoch,
+    /// Time of its joints in ns since 1970.
+    at_ns: u64,
+}
+
+impl NewestEpoch {
+    /// Returns the number of an epoch: of those with its value modulo 256, the nearest to what is expected at `at_ns`.
+    /// Times that run backwards count as equal.
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_precision_loss,
+        reason = "at most 2^64 ns: fewer than 2^53 epochs at any rate of a skin"
+    )]
+    fn number_of(&self, epoch: Epoch, at_ns: u64, broadcast_hz: f64) -> i64 {
+        let since = i64::from(epoch.epochs_since(self.epoch));
+        let expected = at_ns.saturating_sub(self.at_ns) as f64 * 1e-9 * broadcast_hz;
+        let wraps = ((expected - since as f64) / 256.0).round() as i64;
+        self.number + since + 256 * wraps
+    }
+}
+
 /// Joins the joints of several buses into epochs.
 struct EpochJoiner<'a> {
     skin: &'a Skin,
@@ -223,7 +248,7 @@ struct EpochJoiner<'a> {
     waiting: BTreeMap<i64, (Epoch, Vec<Option<ObservedJoints>>)>,
     /// The newest epoch number of each bus that has cells.
     last: Vec<(usize, Option<i64>)>,
-    newest: Option<(i64, Epoch)>,
+    newest: Option<NewestEpoch>,
 }
 
 impl<'a> EpochJoiner<'a> {
@@ -242,16 +267,18 @@ impl<'a> EpochJoiner<'a> {
 
     /// Collects the joints of each bus whose answers are complete; at the end of the capture, all joints.
     fn collect_complete_joints(&mut self, is_end: bool) {
+        let broadcast_hz = self.skin.timing.broadcast_hz();
         for (bus, last) in &mut self.last {
             while let Some((epoch, moment)) = self.watch.pop_joints(*bus, is_end) {
-                let (newest, of_newest) = self.newest.unwrap_or((0, epoch));
-                let mut number = newest + i64::from(epoch.epochs_since(of_newest));
+                let at_ns = moment.at_ns;
+                let newest = self.newest.unwrap_or(NewestEpoch { number: 0, epoch, at_ns });
+                let mut number = newest.number_of(epoch, at_ns, broadcast_hz);
                 while last.is_some_and(|last| number <= last) {
                     number += 256;
                 }
                 *last = Some(number);
-                if number >= newest {
-                    self.newest = Some((number, epoch));
+                if number >= newest.number {
+                    self.newest = Some(NewestEpoch { number, epoch, at_ns });
                 }
                 let buses = self.skin.buses.len();
                 let (_, moments) = self.waiting.entry(number).or_insert_with(|| (epoch, vec![None; buses]));
@@ -265,7 +292,7 @@ impl<'a> EpochJoiner<'a> {
     /// Removes and returns the oldest epoch, once no bus can add joints to it.
     fn pop_oldest_epoch(&mut self, is_end: bool) -> Option<EpochTorque> {
         let (number, _) = self.waiting.first_key_value()?;
-        let newest = self.newest.map_or(*number, |(newest, _)| newest);
+        let newest = self.newest.map_or(*number, |newest| newest.number);
         let is_passed = self.last.iter().all(|(_, last)| last.is_some_and(|last| last >= *number));
         if !is_end && !is_passed && newest - number <= MAX_BUS_LAG_EPOCHS {
             return None;
