@@ -8,7 +8,8 @@ use rustix::fs::{CWD, RenameFlags, renameat_with};
 
 use super::npy::{Element, NpyFile};
 use crate::files::{
-    create_unnamed_file, exists_error, rename, sync_folder, temporary_name, with_creation_hint,
+    create_unnamed_file, exists_error, lock_exclusively, rename, sync_folder, temporary_name,
+    with_creation_hint,
 };
 
 /// The name of the file that describes the columns. A folder with it is one of columns.
@@ -21,11 +22,14 @@ pub const FORMAT_VERSION: u32 = 1;
 const MARKER_BYTES: u64 = 64;
 
 /// A folder that gets its name only when all its files are complete. Until then it is called `.NAME.PID.part`, and is
-/// removed if the program fails.
+/// removed if the program fails. If the program is killed it stays, until a conversion to the same name has the same
+/// process id.
 #[derive(Debug)]
 pub struct ColumnFolder {
     path: PathBuf,
     overwrite: bool,
+    /// The folder, locked as long as it is written: a process in another container may have the same id.
+    _lock: File,
     /// The folder as long as it has its temporary name.
     part: Option<PathBuf>,
 }
@@ -39,8 +43,18 @@ impl ColumnFolder {
     pub fn create(path: &Path, overwrite: bool) -> io::Result<Self> {
         check_columns_writable(path, overwrite)?;
         let part = temporary_name(path);
-        fs::create_dir(&part).map_err(with_creation_hint)?;
-        Ok(Self { path: path.to_owned(), overwrite, part: Some(part) })
+        match fs::create_dir(&part) {
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
+                remove_left_part(&part)?;
+                fs::create_dir(&part)
+            }
+            created => created,
+        }
+        .map_err(with_creation_hint)?;
+        let lock = File::open(&part).inspect_err(|_| remove_columns(&part))?;
+        // Not every file system has locks.
+        let _ = lock_exclusively(&lock);
+        Ok(Self { path: path.to_owned(), overwrite, _lock: lock, part: Some(part) })
     }
 
     /// Creates the file of a column.
@@ -159,14 +173,47 @@ fn is_column_file(name: &Path) -> bool {
     name == Path::new(DESCRIPTION_FILE) || name.extension().is_some_and(|end| end == "npy")
 }
 
-/// Removes the columns of a folder, and the folder if nothing else is in it. Errors cannot be handled here.
+/// Removes the folder of a killed conversion that had the same process id.
+fn remove_left_part(part: &Path) -> io::Result<()> {
+    if is_left_part(part)? {
+        remove_columns(part);
+        return Ok(());
+    }
+    let name = part.display();
+    let why =
+        format!("{name} exists, and no killed conversion has left it: move it away, or name another folder");
+    Err(io::Error::new(io::ErrorKind::AlreadyExists, why))
+}
+
+/// Returns true for a folder that has only columns and that no process writes.
+fn is_left_part(part: &Path) -> io::Result<bool> {
+    if !fs::symlink_metadata(part)?.is_dir() {
+        return Ok(false);
+    }
+    let is_locked =
+        lock_exclusively(&File::open(part)?).is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock);
+    let mut has_others = false;
+    for entry in fs::read_dir(part)? {
+        let entry = entry?;
+        has_others |= !entry.file_type()?.is_file() || !is_column_file(Path::new(&entry.file_name()));
+    }
+    Ok(!is_locked && !has_others)
+}
+
+/// Removes the columns of a folder, and the folder if nothing else is in it. The description is removed last, so that
+/// the rest is still a folder of columns if this is interrupted or fails. Errors cannot be handled here.
 fn remove_columns(path: &Path) {
+    let mut is_rest = false;
     for entry in fs::read_dir(path).into_iter().flatten().flatten() {
-        if is_column_file(Path::new(&entry.file_name())) {
-            let _ = fs::remove_file(entry.path());
+        let name = entry.file_name();
+        if name != DESCRIPTION_FILE && is_column_file(Path::new(&name)) {
+            is_rest |= fs::remove_file(entry.path()).is_err();
         }
     }
-    let _ = fs::remove_dir(path);
+    if !is_rest {
+        let _ = fs::remove_file(path.join(DESCRIPTION_FILE));
+        let _ = fs::remove_dir(path);
+    }
 }
 
 #[cfg(test)]

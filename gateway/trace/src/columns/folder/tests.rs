@@ -95,3 +95,57 @@ fn only_a_folder_of_columns_is_replaced() {
     let none = place.path().join("none/run.columns");
     assert!(refused(&none, true).ends_with("name a file in a folder that can be written"));
 }
+
+#[test]
+fn what_a_killed_conversion_left_is_removed_and_nothing_else() {
+    let place = tempfile::tempdir().unwrap();
+    let path = place.path().join("run.columns");
+    let part = temporary_name(&path);
+    fs::create_dir(&part).unwrap();
+    fs::write(part.join("frames.at_ns.npy"), "old").unwrap();
+    fs::write(part.join(DESCRIPTION_FILE), DESCRIPTION).unwrap();
+    let folder = ColumnFolder::create(&path, false).unwrap();
+    assert_eq!(fs::read_dir(&part).unwrap().count(), 0);
+    let refused = || {
+        let error = ColumnFolder::create(&path, false).unwrap_err().to_string();
+        assert!(
+            error.contains(".part exists, and no killed conversion has left it: move it away"),
+            "{error}"
+        );
+    };
+    refused();
+    assert!(part.exists(), "it is still written");
+    drop(folder);
+    assert!(!part.exists());
+    for name in ["thesis.txt", "old.npy"] {
+        let other = part.join(name);
+        if name == "old.npy" {
+            fs::create_dir_all(&other).unwrap();
+        } else {
+            fs::create_dir(&part).unwrap();
+            fs::write(&other, "mine").unwrap();
+        }
+        refused();
+        assert!(other.exists(), "{name}");
+        fs::remove_dir_all(&part).unwrap();
+    }
+    let others = place.path().join("others");
+    fs::create_dir(&others).unwrap();
+    std::os::unix::fs::symlink(&others, &part).unwrap();
+    refused();
+    assert!(part.is_symlink() && others.exists());
+}
+
+#[test]
+fn a_folder_whose_columns_are_not_all_removed_is_still_one_of_columns() {
+    let place = tempfile::tempdir().unwrap();
+    let path = place.path().join("run.columns");
+    fs::create_dir_all(path.join("no_file.npy")).unwrap();
+    fs::write(path.join("a.npy"), "").unwrap();
+    fs::write(path.join(DESCRIPTION_FILE), DESCRIPTION).unwrap();
+    remove_columns(&path);
+    assert!(!path.join("a.npy").exists() && has_description(&path));
+    fs::remove_dir(path.join("no_file.npy")).unwrap();
+    remove_columns(&path);
+    assert!(!path.exists());
+}
