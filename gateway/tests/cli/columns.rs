@@ -67,7 +67,7 @@ fn integers(folder: &TempDir, name: &str) -> Vec<i64> {
 
 fn description(folder: &TempDir, name: &str) -> Value {
     let text = fs::read_to_string(folder.path().join(name).join("columns.json")).unwrap();
-    assert!(text.starts_with("{\n  \"skinbus_columns\": 1,\n"), "{text}");
+    assert!(text.starts_with("{\n  \"skinbus_columns\": 2,\n"), "{text}");
     serde_json::from_str(&text).unwrap()
 }
 

@@ -170,7 +170,7 @@ class BusReport:
     epoch: int | None = None
     """Present epoch; None before the first joints."""
     number: int = 0
-    """Number of the bus's joints so far, which counts on beyond 255."""
+    """Number of the present epoch, which counts on beyond 255."""
     dropped_frames: int = 0
     """Frames that the channel to this program read too late."""
 

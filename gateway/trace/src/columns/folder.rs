@@ -17,7 +17,7 @@ pub const DESCRIPTION_FILE: &str = "columns.json";
 /// The first key of the description, with the version of the format as its value.
 pub const FORMAT_KEY: &str = "skinbus_columns";
 /// The version of the format.
-pub const FORMAT_VERSION: u32 = 1;
+pub const FORMAT_VERSION: u32 = 2;
 /// Number of bytes at the beginning of a description that contain the first key.
 const MARKER_BYTES: u64 = 64;
 
