@@ -324,7 +324,7 @@ impl ControlBus {
             (is_press && force <= 0.0).then_some(UnconfirmedReason::BelowThreshold)
         };
         let is_touched = place.and_then(|place| self.cells.get(place)).is_some_and(|cell| cell.is_touched);
-        let must_answer = is_press || is_touched || self.presses.is_pressing(cell);
+        let must_answer = is_press || self.presses.pending_touch(cell).unwrap_or(is_touched);
         let first = self.presses.first_epoch(cell, self.number);
         Press { id, cell, force_n, sensors, first, at, hidden, must_answer }
     }

@@ -125,11 +125,11 @@ impl PendingPresses {
         .map(|sent| &sent.press)
     }
 
-    /// Returns true if a force on a cell is under way.
-    pub(super) fn is_pressing(&self, cell: CellId) -> bool {
+    /// Returns true if the last press of a cell that was sent will touch it, false if it will not, and `None` if none is
+    /// pending. A held press does not count: the next press replaces it.
+    pub(super) fn pending_touch(&self, cell: CellId) -> Option<bool> {
         let mut sent = self.sent.iter().map(|sent| &sent.press).filter(|press| press.cell == cell);
-        let latest = self.held.get(&cell).or_else(|| sent.next_back());
-        latest.is_some_and(|press| press.hidden.is_none() && press.force_n > 0.0)
+        sent.next_back().map(|press| press.hidden.is_none() && press.force_n > 0.0)
     }
 
     /// Removes a press that a torque has shown, or that cannot be shown.

@@ -219,6 +219,19 @@ fn a_release_is_shown_by_zeros_and_a_touched_cell_has_to_send_them() {
         played.beat();
     }
     assert_eq!(played.outcomes(), [(3, json!("no-answer"))]);
+    // Of two releases, the first one ends the contact.
+    played.line(&json!({"do": "press", "cell": 1, "force_n": 3, "id": 4}));
+    (0..2).for_each(|_| played.begin_epoch());
+    played.answer_joints(played.epoch, 3.0);
+    assert_eq!(played.outcomes(), [(4, json!(played.epoch))]);
+    played.line(&json!({"do": "release", "cell": 1, "id": 5}));
+    played.begin_epoch();
+    played.line(&json!({"do": "release", "cell": 1, "id": 6}));
+    played.begin_epoch();
+    played.answer_joints(played.epoch, 0.0);
+    (0..5).for_each(|_| played.begin_epoch());
+    played.beat();
+    assert_eq!(played.outcomes(), [(5, json!(played.epoch - 5)), (6, json!("not-touched"))]);
 }
 
 #[test]
