@@ -161,7 +161,7 @@ fn torques_that_come_in_sums_are_empty_and_the_central_ones_are_there() {
 #[test]
 fn torques_are_empty_in_an_epoch_that_a_bus_of_the_joint_lacks() {
     let folder = folder(&["two.mcap"]);
-    said(&folder, "convert two.mcap two.log --direction", 0);
+    gateway(folder.path(), "convert two.mcap two.log");
     let log = fs::read_to_string(folder.path().join("two.log")).unwrap();
     let is_joints = |line: &str, bus: &str| line.contains(&format!(" {bus} 001#"));
     // In classic CAN, joints of six words have two frames.

@@ -18,8 +18,8 @@ use super::observed::ObservedJoints;
 use super::watch::JointsWatcher;
 use super::{Explainer, JointTorqueTotal, JointsNotFound, TorqueExplanation};
 
-/// Number of epochs that a bus may be behind the others before they no longer wait for it.
-const MAX_BUS_LAG_EPOCHS: i64 = 64;
+/// Number of epochs that wait for a bus which is behind the others, besides the oldest.
+const MAX_BUS_LAG_EPOCHS: usize = 64;
 
 /// The torques of one epoch.
 #[derive(Clone, Debug, PartialEq)]
@@ -212,28 +212,41 @@ pub(crate) fn is_summed(skin: &Skin, joint: usize) -> bool {
     })
 }
 
-/// The newest epoch of all buses.
+/// An epoch whose number is known.
 #[derive(Clone, Copy, Debug)]
-struct NewestEpoch {
+struct NumberedEpoch {
     number: i64,
     epoch: Epoch,
     /// Time of its joints in ns since 1970.
     at_ns: u64,
 }
 
-impl NewestEpoch {
-    /// Returns the number of an epoch: of those with its value modulo 256, the nearest to what is expected at `at_ns`.
-    /// Times that run backwards count as equal.
-    #[expect(
-        clippy::cast_possible_truncation,
-        clippy::cast_precision_loss,
-        reason = "at most 2^64 ns: fewer than 2^53 epochs at any rate of a skin"
-    )]
-    fn number_of(&self, epoch: Epoch, at_ns: u64, broadcast_hz: f64) -> i64 {
-        let since = i64::from(epoch.epochs_since(self.epoch));
-        let expected = at_ns.saturating_sub(self.at_ns) as f64 * 1e-9 * broadcast_hz;
-        let wraps = ((expected - since as f64) / 256.0).round() as i64;
-        self.number + since + 256 * wraps
+/// Returns the number of a bus' next joints: of the numbers that fit the epoch, the nearest to what is expected at
+/// their time, but above that of the bus' `last` joints. `newest` is the newest epoch of all buses.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_precision_loss,
+    reason = "at most 2^64 ns: fewer than 2^53 epochs at any rate of a skin"
+)]
+fn next_number(
+    newest: &NumberedEpoch,
+    last: Option<&NumberedEpoch>,
+    epoch: Epoch,
+    at_ns: u64,
+    broadcast_hz: f64,
+) -> i64 {
+    // The newest joints are not older than the bus' last ones, unless the clock was set back meanwhile.
+    let newest_ns = last.map_or(newest.at_ns, |last| newest.at_ns.max(last.at_ns));
+    let expected = (i128::from(at_ns) - i128::from(newest_ns)) as f64 * 1e-9 * broadcast_hz;
+    let since = i64::from(epoch.epochs_since(newest.epoch));
+    let wraps = ((expected - since as f64) / 256.0).round() as i64;
+    let number = newest.number + since + 256 * wraps;
+    match last {
+        Some(last) if number <= last.number => {
+            let first = last.number + 1;
+            first + (number - first).rem_euclid(256)
+        }
+        _ => number,
     }
 }
 
@@ -246,9 +259,10 @@ struct EpochJoiner<'a> {
     summed: Vec<bool>,
     /// Epochs for which joints of some buses are still missing, by their number and then by bus.
     waiting: BTreeMap<i64, (Epoch, Vec<Option<ObservedJoints>>)>,
-    /// The newest epoch number of each bus that has cells.
-    last: Vec<(usize, Option<i64>)>,
-    newest: Option<NewestEpoch>,
+    /// The newest epoch of each bus that has cells.
+    last: Vec<(usize, Option<NumberedEpoch>)>,
+    /// The newest epoch of all buses.
+    newest: Option<NumberedEpoch>,
 }
 
 impl<'a> EpochJoiner<'a> {
@@ -271,14 +285,12 @@ impl<'a> EpochJoiner<'a> {
         for (bus, last) in &mut self.last {
             while let Some((epoch, moment)) = self.watch.pop_joints(*bus, is_end) {
                 let at_ns = moment.at_ns;
-                let newest = self.newest.unwrap_or(NewestEpoch { number: 0, epoch, at_ns });
-                let mut number = newest.number_of(epoch, at_ns, broadcast_hz);
-                while last.is_some_and(|last| number <= last) {
-                    number += 256;
-                }
-                *last = Some(number);
+                let newest = self.newest.get_or_insert(NumberedEpoch { number: 0, epoch, at_ns });
+                let number = next_number(newest, last.as_ref(), epoch, at_ns, broadcast_hz);
+                let numbered = NumberedEpoch { number, epoch, at_ns };
+                *last = Some(numbered);
                 if number >= newest.number {
-                    self.newest = Some(NewestEpoch { number, epoch, at_ns });
+                    *newest = numbered;
                 }
                 let buses = self.skin.buses.len();
                 let (_, moments) = self.waiting.entry(number).or_insert_with(|| (epoch, vec![None; buses]));
@@ -292,9 +304,8 @@ impl<'a> EpochJoiner<'a> {
     /// Removes and returns the oldest epoch, once no bus can add joints to it.
     fn pop_oldest_epoch(&mut self, is_end: bool) -> Option<EpochTorque> {
         let (number, _) = self.waiting.first_key_value()?;
-        let newest = self.newest.map_or(*number, |newest| newest.number);
-        let is_passed = self.last.iter().all(|(_, last)| last.is_some_and(|last| last >= *number));
-        if !is_end && !is_passed && newest - number <= MAX_BUS_LAG_EPOCHS {
+        let is_passed = self.last.iter().all(|(_, last)| last.is_some_and(|last| last.number >= *number));
+        if !is_end && !is_passed && self.waiting.len() <= 1 + MAX_BUS_LAG_EPOCHS {
             return None;
         }
         let (number, (epoch, moments)) = self.waiting.pop_first()?;
