@@ -21,7 +21,7 @@ use protocol::document;
 use protocol::input::can_be_read_again;
 use protocol::skin::{CellName, Skin};
 use protocol::time::Span;
-use protocol::usage::{Failure, command_line, shell_quoted_os};
+use protocol::usage::{Failure, command_line, eprint_lines, shell_quoted_os};
 use trace::recording::series::{AttachedFile, SplitLimits};
 
 use super::arguments::{
@@ -434,7 +434,7 @@ fn run_bench(
     } else if is_controlled {
         // Standard output has events only.
         if is_verbose {
-            print_note(table(false).trim_end())
+            eprint_lines(&table(false));
         }
         Ok(())
     } else {

@@ -202,7 +202,8 @@ fn a_run_whose_program_has_gone_ends_and_leaves_nothing() {
     let place = TestDir::new();
     place.skin(3);
     // The input ends before the loop runs.
-    let (last, status, _) = place.starting_controlled_run("").end();
+    let (last, status, stderr) = place.starting_controlled_run("--verbose").end();
+    assert!(stderr.lines().filter(|line| line.starts_with('│')).count() > 5, "{stderr}");
     assert_eq!((last["code"].as_u64(), status.code()), (Some(0), Some(0)));
     place.is_left_clean();
 
