@@ -114,7 +114,7 @@ struct Description<'a> {
     robot: &'a str,
     began_ns: u64,
     broadcast_hz: f64,
-    /// What is missing at the end of a capture that was not finished.
+    /// The part that is missing at the end of a capture that was not finished.
     unfinished: Option<&'a str>,
     joints: Vec<JointFacts<'a>>,
     buses: Vec<BusFacts<'a>>,

@@ -79,20 +79,14 @@ impl ControlBus {
         self.live.sums
     }
 
-    /// Returns the number and the byte of the present epoch; `None` before the first joints.
-    pub(super) fn epoch(&self) -> Option<(u64, Epoch)> {
-        self.live.current.map(|current| (self.number, current.epoch))
-    }
-
-    /// Returns the byte of the epoch with this number.
-    pub(super) fn epoch_with_number(&self, number: u64) -> Epoch {
-        let present = self.epoch().map(|(_, epoch)| epoch).unwrap_or_default();
-        present.advanced_by(number.wrapping_sub(self.number).to_le_bytes()[0])
+    /// Returns true if joints have come since the start or the last loss of the bus.
+    pub(super) const fn has_joints(&self) -> bool {
+        self.live.current.is_some()
     }
 
     /// Returns true if joints and a heartbeat of each cell were received.
     pub(super) fn is_complete(&self) -> bool {
-        self.live.current.is_some() && self.live.table.cells().iter().all(|cell| cell.heartbeat().is_some())
+        self.has_joints() && self.live.table.cells().iter().all(|cell| cell.heartbeat().is_some())
     }
 
     /// Returns true if an epoch is complete, so that its torques are known.
@@ -184,10 +178,9 @@ impl ControlBus {
         let Some(place) = self.live.table.index_of(from) else { return };
         let is_zero = words.as_slice().iter().all(|&word| word == 0);
         self.set_touched(place, !is_zero, epoch, at_ns, events);
-        let Some((present, present_epoch)) = self.epoch() else { return };
-        let Some(number) = present.checked_add_signed(epoch.epochs_since(present_epoch).into()) else {
-            return;
-        };
+        let Some(present) = self.live.current else { return };
+        let since = epoch.epochs_since(present.epoch);
+        let Some(number) = self.number.checked_add_signed(since.into()) else { return };
         let Some(press) = self.presses.pending_in(from, number).cloned() else { return };
         if press.hidden.is_some() {
             return;
@@ -213,15 +206,20 @@ impl ControlBus {
             return self.presses.note(from, press.first, reason);
         }
         self.presses.remove(from, press.first);
-        let joints = self.live.joint_torques().count();
         events.push(ControlEvent::Confirmed {
             id: press.id,
             cell: self.cell_text(from),
             force_n: press.force_n,
             epoch: epoch.0,
             at_ns,
-            torque: words.as_slice().iter().take(joints).map(|&word| format.to_real(word)).collect(),
+            torque: self.real_torque(words),
         });
+    }
+
+    /// Returns a torque in Nm or N, by joint of the chain.
+    fn real_torque(&self, words: &Words) -> Vec<f64> {
+        let joints = self.live.joint_torques().zip(words.as_slice());
+        joints.map(|(_, &word)| self.live.torque_format.to_real(word)).collect()
     }
 
     fn set_touched(
@@ -394,7 +392,7 @@ impl ControlBus {
             bus: self.name().to_owned(),
             up: self.live.is_up,
             halted: self.live.halted,
-            epoch: self.epoch().map(|(_, epoch)| epoch.0),
+            epoch: self.live.current.map(|current| current.epoch.0),
             number: self.number,
             dropped_frames: self.live.dropped,
         }
@@ -402,8 +400,6 @@ impl ControlBus {
 
     /// Returns the cells with a torque, or in a state that a user may not expect.
     pub(super) fn reported_cells(&self, now: Micros) -> Vec<ReportedCell> {
-        let joints = self.live.joint_torques().count();
-        let format = self.live.torque_format;
         let cells = self.live.table.statuses(now).zip(&self.live.last);
         let cells = cells.filter(|((_, status), last)| *status != CellStatus::Quiet || last.is_some());
         cells
@@ -411,9 +407,7 @@ impl ControlBus {
                 cell: self.cell_text(cell.node),
                 status: status.name(),
                 epoch: last.map(|(epoch, _)| epoch.0),
-                torque: last.map(|(_, words)| {
-                    words.as_slice().iter().take(joints).map(|&word| format.to_real(word)).collect()
-                }),
+                torque: last.map(|(_, words)| self.real_torque(&words)),
             })
             .collect()
     }

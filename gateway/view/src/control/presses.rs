@@ -11,8 +11,9 @@
 
 use std::collections::BTreeMap;
 
-use protocol::id::CellId;
-use protocol::message::SkinSensors;
+use protocol::id::{CellId, Node};
+use protocol::message::{Message, SensorPage, SkinSensors, StimulusStart};
+use protocol::packet::Epoch;
 use protocol::time::Micros;
 
 use super::event::{RequestId, UnconfirmedReason};
@@ -56,6 +57,19 @@ struct SentPress {
     seen: Option<UnconfirmedReason>,
     /// The time since which no torque can show the press, unless it is on its way.
     expired: Option<Micros>,
+}
+
+impl Press {
+    /// Returns the byte of the first epoch that the stimulus holds for, which its number continues.
+    pub(super) const fn first_epoch(&self) -> Epoch {
+        Epoch(self.first.to_le_bytes()[0])
+    }
+
+    /// Returns the stimulus.
+    pub(super) fn stimulus(&self) -> Message {
+        let from = StimulusStart::Epoch(self.first_epoch());
+        Message::Stimulus { to: Node::Cell(self.cell), from, page: SensorPage::Skin(self.sensors) }
+    }
 }
 
 /// The presses of the cells of one bus.

@@ -6,9 +6,8 @@ use std::mem;
 use bench::remote::{BenchCommand, BenchState, TickLateness};
 use model::scenario::contact_words;
 use protocol::can::Frame;
-use protocol::id::{CellId, Node};
-use protocol::message::{Message, SensorPage, SkinSensors, StimulusStart};
-use protocol::packet::Epoch;
+use protocol::id::CellId;
+use protocol::message::{Message, SkinSensors};
 use protocol::skin::{CellName, Skin};
 use protocol::time::Micros;
 
@@ -115,7 +114,7 @@ impl ControlState {
         let ControlOutput { events, messages, .. } = &mut self.output;
         let every = if self.is_ready { self.every } else { 0 };
         for press in of.handle_frame(at_ns, frame, every, events) {
-            messages.push((bus, stimulus(&press, of.epoch())));
+            messages.push((bus, press.stimulus()));
         }
         // Before the first event the program cannot know of the bench.
         if !self.is_ready {
@@ -337,26 +336,16 @@ impl ControlState {
     ) -> Result<Option<String>, String> {
         match command {
             ControlCommand::Press { cell, force_n } => {
-                let (bus, node) = self.find_cell(cell)?;
-                self.press((now, id, "press"), (bus, node), *force_n)?;
+                let cell = self.find_cell(cell)?;
+                self.press_and_answer((now, id, "press"), cell, *force_n)?;
                 Ok(None)
             }
             ControlCommand::Release { cell: Some(cell) } => {
-                let (bus, node) = self.find_cell(cell)?;
-                self.press((now, id, "release"), (bus, node), 0.0)?;
+                let cell = self.find_cell(cell)?;
+                self.press_and_answer((now, id, "release"), cell, 0.0)?;
                 Ok(None)
             }
-            ControlCommand::Release { cell: None } => {
-                let cells = mem::take(&mut self.pressed);
-                let before = self.output.events.len();
-                for &cell in &cells {
-                    self.press((now, id.clone(), "release"), cell, 0.0)?;
-                }
-                // One event answers the command; those of the single cells would answer it again.
-                let events = self.output.events.split_off(before).into_iter();
-                self.output.events.extend(events.filter(|it| !matches!(it, ControlEvent::Accepted { .. })));
-                Ok(Some(format!("release {} cells", cells.len())))
-            }
+            ControlCommand::Release { cell: None } => self.release_all(now, id).map(Some),
             ControlCommand::Halt {} | ControlCommand::Resume {} => {
                 let is_halt = matches!(command, ControlCommand::Halt {});
                 let message = if is_halt { Message::Halt } else { Message::Resume };
@@ -386,37 +375,67 @@ impl ControlState {
     }
 
     /// Presses or releases a cell, and answers the command.
-    fn press(
+    fn press_and_answer(
         &mut self,
         (now, id, command): (Micros, Option<RequestId>, &'static str),
+        cell: (usize, CellId),
+        force_n: f64,
+    ) -> Result<(), String> {
+        let press = self.new_press((now, id.clone()), cell, force_n)?;
+        let asked = AskedStimulus {
+            cell: self.cell_text(cell.0, cell.1),
+            force_n: press.force_n,
+            epoch: press.first_epoch().0,
+        };
+        self.output.events.push(ControlEvent::Accepted { id, command, stimulus: Some(asked), text: None });
+        self.carry_out(cell.0, press);
+        Ok(())
+    }
+
+    /// Releases all pressed cells. Returns the action in words. Cells on a bus without joints stay pressed, and are
+    /// named in the error.
+    fn release_all(&mut self, now: Micros, id: Option<RequestId>) -> Result<String, String> {
+        let (mut count, mut refused) = (0, None);
+        for cell in self.pressed.clone() {
+            match self.new_press((now, id.clone()), cell, 0.0) {
+                Ok(press) => {
+                    self.carry_out(cell.0, press);
+                    count += 1;
+                }
+                Err(reason) => refused = refused.or(Some(reason)),
+            }
+        }
+        refused.map_or_else(|| Ok(format!("release {count} cells")), Err)
+    }
+
+    /// Creates a press or a release of a cell.
+    fn new_press(
+        &self,
+        (now, id): (Micros, Option<RequestId>),
         (index, node): (usize, CellId),
         asked_n: f64,
-    ) -> Result<(), String> {
+    ) -> Result<Press, String> {
         let name = self.cell_text(index, node);
-        let Some(bus) = self.buses.get_mut(index) else { return Ok(()) };
-        if bus.epoch().is_none() {
-            return Err(format!(
-                "cell {name}: no joints come on {}: wait for the bus, or bring it up",
-                bus.name()
-            ));
-        }
+        let bus = self.buses.get(index).filter(|bus| bus.has_joints()).ok_or_else(|| {
+            let bus = self.skin.buses.get(index).map_or("", |bus| bus.name.as_str());
+            format!("cell {name}: no joints come on {bus}: wait for the bus, or bring it up")
+        })?;
         let contact = contact_words(asked_n);
         let sensors = SkinSensors { contact, ..bus.latched_sensors(node, now).unwrap_or_default() };
         let force_n = contact.iter().map(|word| word.to_f64()).sum();
-        let press = bus.new_press(id.clone(), node, (asked_n > 0.0, force_n, sensors), now);
-        let epoch = bus.epoch_with_number(press.first).0;
-        let stimulus_event = AskedStimulus { cell: name, force_n, epoch };
-        let events = &mut self.output.events;
-        events.push(ControlEvent::Accepted { id, command, stimulus: Some(stimulus_event), text: None });
-        if force_n > 0.0 {
-            self.pressed.insert((index, node));
+        Ok(bus.new_press(id, node, (asked_n > 0.0, force_n, sensors), now))
+    }
+
+    /// Sends the stimulus of a press, or holds it.
+    fn carry_out(&mut self, index: usize, press: Press) {
+        if press.force_n > 0.0 {
+            self.pressed.insert((index, press.cell));
         } else {
-            self.pressed.remove(&(index, node));
+            self.pressed.remove(&(index, press.cell));
         }
-        if let Some(sent) = bus.add_press(press, events) {
-            self.output.messages.push((index, stimulus(&sent, bus.epoch())));
-        }
-        Ok(())
+        let Some(bus) = self.buses.get_mut(index) else { return };
+        let sent = bus.add_press(press, &mut self.output.events);
+        self.output.messages.extend(sent.map(|sent| (index, sent.stimulus())));
     }
 
     fn report(&self, id: Option<RequestId>, now: Micros) -> ControlEvent {
@@ -441,6 +460,9 @@ impl ControlState {
         }
         let buses = self.buses.iter().map(ControlBus::report).collect::<Vec<ReportedBus>>();
         let TickLateness { all: lateness_us, skipped, .. } = self.bench.lateness;
+        if !self.buses.iter().all(ControlBus::has_joints) {
+            all.positions.clear();
+        }
         if !self.buses.iter().all(ControlBus::has_complete_epoch) {
             all.distributed.clear();
             all.central.clear();
@@ -468,15 +490,6 @@ impl ControlState {
     fn cell_text(&self, bus: usize, node: CellId) -> String {
         format!("{}:{node}", self.skin.buses.get(bus).map_or("", |bus| bus.name.as_str()))
     }
-}
-
-/// Returns the stimulus of a press.
-fn stimulus(press: &Press, present: Option<(u64, Epoch)>) -> Message {
-    let page = SensorPage::Skin(press.sensors);
-    let from = present.map_or(StimulusStart::Next, |(number, epoch)| {
-        StimulusStart::Epoch(epoch.advanced_by(press.first.saturating_sub(number).to_le_bytes()[0]))
-    });
-    Message::Stimulus { to: Node::Cell(press.cell), from, page }
 }
 
 #[cfg(test)]

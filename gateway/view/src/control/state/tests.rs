@@ -4,8 +4,9 @@ use model::central::CentralComputation;
 use model::testing::ONE_CELL_SKIN_TOML;
 use protocol::can::Format;
 use protocol::fixed::TorqueFormat;
-use protocol::message::{Heartbeat, Joints, NetworkPage, State};
-use protocol::packet::{Length, Words};
+use protocol::id::Node;
+use protocol::message::{Heartbeat, Joints, NetworkPage, State, StimulusStart};
+use protocol::packet::{Epoch, Length, Words};
 use protocol::parameters::MAX_JOINTS;
 use serde_json::{Value, json};
 
@@ -251,9 +252,27 @@ fn no_stimulus_names_an_epoch_from_before_a_loss_of_the_bus() {
     let events = played.line(&json!({"do": "press", "cell": 1, "force_n": 1, "id": 1}));
     assert_eq!(events.last().unwrap()["event"], "error", "{events:?}");
     assert_eq!(played.state.output.messages, []);
+    let report = played.line(&json!({"do": "report"})).remove(0);
+    assert_eq!((&report["positions"], &report["central"]), (&json!([]), &json!([])), "they are unknown");
     played.state.handle_bus_state(played.now(), 0, true, 0);
     played.epoch += 100;
     played.begin_epoch();
     let events = played.line(&json!({"do": "press", "cell": 1, "force_n": 1, "id": 2}));
     assert_eq!(events.last().unwrap()["epoch"], played.epoch + 2, "{events:?}");
+}
+
+#[test]
+fn cells_on_a_lost_bus_stay_pressed_until_they_can_be_released() {
+    let mut played = Played::ready();
+    played.state.handle_bus_state(played.now(), 0, true, 0);
+    played.line(&json!({"do": "press", "cell": 1, "force_n": 1, "id": 1}));
+    played.state.handle_bus_state(played.now(), 0, false, 0);
+    let events = played.line(&json!({"do": "release", "id": 2}));
+    let reason = "cell vcan0:1: no joints come on vcan0: wait for the bus, or bring it up";
+    assert_eq!(events, [json!({"event": "error", "id": 2, "text": reason})]);
+    played.state.handle_bus_state(played.now(), 0, true, 0);
+    played.begin_epoch();
+    let events = played.line(&json!({"do": "release", "id": 3}));
+    let accepted = json!({"event": "accepted", "id": 3, "do": "release", "text": "release 1 cells"});
+    assert_eq!(events.last(), Some(&accepted));
 }
