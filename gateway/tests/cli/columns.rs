@@ -5,7 +5,6 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::io::Write;
 use std::os::unix::fs::PermissionsExt;
-use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::thread;
 use std::time::Duration;
@@ -13,34 +12,11 @@ use std::time::Duration;
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 use tempfile::TempDir;
-use trace::capture::Reader;
+
+use super::recorded::{folder, skinbus};
 
 /// Length of the header of a column.
 const HEADER_BYTES: usize = 128;
-
-fn recordings() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/recordings")
-}
-
-fn skinbus(folder: &Path, arguments: &str) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_skinbus"));
-    command.args(arguments.split(' ').filter(|word| !word.is_empty())).current_dir(folder).output().unwrap()
-}
-
-/// A directory with recordings and the skin of each.
-fn folder(names: &[&str]) -> TempDir {
-    let folder = tempfile::tempdir().unwrap();
-    for name in names {
-        let from = recordings().join(name);
-        fs::copy(&from, folder.path().join(name)).unwrap();
-        let reader = Reader::open(&from).unwrap();
-        let skin = reader.extras().attachments.iter().find(|(name, _)| name == "skin.toml");
-        if let Some((_, skin)) = skin {
-            fs::write(folder.path().join(name).with_extension("toml"), skin).unwrap();
-        }
-    }
-    folder
-}
 
 /// The last line of a command that ends with this code.
 fn said(folder: &TempDir, arguments: &str, code: i32) -> String {

@@ -10,6 +10,7 @@ mod foreign;
 mod inspect;
 mod memory;
 mod mutations;
+mod recorded;
 mod recordings;
 mod recover;
 mod report;

@@ -4,43 +4,19 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::Output;
 
 use serde_json::Value;
 use tempfile::TempDir;
-use trace::capture::Reader;
+
+use super::recorded::{folder, skinbus};
 
 /// Number of rows from one compared row to the next.
 const ROW_INTERVAL: usize = 9;
 
-fn recordings() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/recordings")
-}
-
-fn gateway(folder: &Path, arguments: &str) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_skinbus"));
-    command.args(arguments.split(' ').filter(|word| !word.is_empty())).current_dir(folder).output().unwrap()
-}
-
-/// A directory with recordings and the skin of each.
-fn folder(names: &[&str]) -> TempDir {
-    let folder = tempfile::tempdir().unwrap();
-    for name in names {
-        let from = recordings().join(name);
-        fs::copy(&from, folder.path().join(name)).unwrap();
-        let reader = Reader::open(&from).unwrap();
-        let skin = reader.extras().attachments.iter().find(|(name, _)| name == "skin.toml");
-        if let Some((_, skin)) = skin {
-            fs::write(folder.path().join(name).with_extension("toml"), skin).unwrap();
-        }
-    }
-    folder
-}
-
 /// The one-line message of a command that ends with this code.
 fn said(folder: &TempDir, arguments: &str, code: i32) -> String {
-    let Output { status, stderr, .. } = gateway(folder.path(), arguments);
+    let Output { status, stderr, .. } = skinbus(folder.path(), arguments);
     let said = String::from_utf8(stderr).unwrap();
     assert_eq!((status.code(), said.matches('\n').count()), (Some(code), 1), "{arguments}: {said}");
     said.trim_end().to_owned()
@@ -68,7 +44,7 @@ fn compared(folder: &TempDir, rows: &[Row], capture: &str) -> usize {
         next = seconds;
         let epoch = &row["epoch"];
         let at = (seconds - 0.004).max(0.0);
-        let ended = gateway(folder.path(), &format!("explain {capture} --epoch {epoch} --at {at:.6} --json"));
+        let ended = skinbus(folder.path(), &format!("explain {capture} --epoch {epoch} --at {at:.6} --json"));
         let explained: Value = serde_json::from_slice(&ended.stdout).unwrap();
         let number =
             |column: &str| row[column].parse::<f64>().unwrap_or_else(|error| panic!("{column}: {error}"));
@@ -144,7 +120,7 @@ fn rows_are_what_explain_says_of_their_epochs_in_recordings_logs_and_parts() {
 #[test]
 fn torques_that_come_in_sums_are_empty_and_the_central_ones_are_there() {
     let folder = folder(&["sums.mcap"]);
-    let Output { status, stderr, .. } = gateway(folder.path(), "convert sums.mcap sums.csv");
+    let Output { status, stderr, .. } = skinbus(folder.path(), "convert sums.mcap sums.csv");
     let said = String::from_utf8(stderr).unwrap();
     assert_eq!(status.code(), Some(0), "{said}");
     assert!(
@@ -161,7 +137,7 @@ fn torques_that_come_in_sums_are_empty_and_the_central_ones_are_there() {
 #[test]
 fn torques_are_empty_in_an_epoch_that_a_bus_of_the_joint_lacks() {
     let folder = folder(&["two.mcap"]);
-    gateway(folder.path(), "convert two.mcap two.log");
+    skinbus(folder.path(), "convert two.mcap two.log");
     let log = fs::read_to_string(folder.path().join("two.log")).unwrap();
     let is_joints = |line: &str, bus: &str| line.contains(&format!(" {bus} 001#"));
     // In classic CAN, joints of six words have two frames.
@@ -173,7 +149,7 @@ fn torques_are_empty_in_an_epoch_that_a_bus_of_the_joint_lacks() {
         let lines = log.lines().enumerate().filter(|(at, line)| !is_left_out(*at, line));
         let lines: String = lines.map(|(_, line)| format!("{line}\n")).collect();
         fs::write(folder.path().join("part.log"), lines).unwrap();
-        gateway(folder.path(), "convert part.log part.csv --skin two.toml --overwrite");
+        skinbus(folder.path(), "convert part.log part.csv --skin two.toml --overwrite");
         rows(&folder, "part.csv")
     };
     let torques = ["distributed_joint2_Nm", "central_joint2_Nm", "error_joint2_Nm"];
@@ -239,7 +215,7 @@ fn what_has_no_torques_is_refused_in_one_line_and_nothing_is_written() {
     fs::write(folder.path().join("begun.mcap"), &bytes[..middle]).unwrap();
     let line = said(&folder, "convert begun.mcap strict.csv --strict --skin fd.toml", 1);
     assert!(line.contains("its end is missing") && !folder.path().join("strict.csv").exists(), "{line}");
-    let Output { status, .. } = gateway(folder.path(), "convert begun.mcap begun.csv --skin fd.toml");
+    let Output { status, .. } = skinbus(folder.path(), "convert begun.mcap begun.csv --skin fd.toml");
     assert_eq!(status.code(), Some(0));
     let cut = rows(&folder, "begun.csv");
     assert!(!cut.is_empty() && cut.len() < 100, "{}", cut.len());
