@@ -125,8 +125,30 @@ class Joints:
         return _data_frame(columns, self.at_ns)
 
 
+class _WordTable:
+    """Base class of tables whose rows are words with a step, one for each joint of a chain."""
+
+    at_ns: Integers
+    words: Words
+    step: float
+
+    def __len__(self) -> int:
+        return len(self.at_ns)
+
+    @property
+    def values(self) -> Floats:
+        """The values in Nm or N, [n, joints of the chain]."""
+        values: Floats = self.words * np.float64(self.step)
+        return values
+
+    @property
+    def saturated(self) -> Bools:
+        """True for words that stand for any larger value, [n, joints of the chain]."""
+        return _is_saturated(self.words)
+
+
 @dataclass(frozen=True)
-class Torques:
+class Torques(_WordTable):
     """Torques of one cell, each an answer to joints.
 
     Attributes:
@@ -148,9 +170,6 @@ class Torques:
     names: tuple[str, ...]
     joints_epoch_row: Integers
 
-    def __len__(self) -> int:
-        return len(self.at_ns)
-
     @property
     def used(self) -> Bools:
         """True for torques that are in the sum of an epoch, [n]."""
@@ -163,17 +182,6 @@ class Torques:
             return np.full(len(self), -1, dtype=np.int64)
         return np.where(self.used, self.joints_epoch_row[self.joints_row], np.int64(-1))
 
-    @property
-    def values(self) -> Floats:
-        """The torques in Nm or N, [n, joints of the chain]."""
-        values: Floats = self.words * np.float64(self.step)
-        return values
-
-    @property
-    def saturated(self) -> Bools:
-        """True for words that stand for any larger torque, [n, joints of the chain]."""
-        return _is_saturated(self.words)
-
     def to_pandas(self) -> pandas.DataFrame:
         """Returns a table with a column for each joint."""
         columns: dict[str, Any] = {"epoch": self.epoch, "epoch_row": self.epoch_row, "used": self.used}
@@ -183,7 +191,7 @@ class Torques:
 
 
 @dataclass(frozen=True)
-class Sums:
+class Sums(_WordTable):
     """Sums that one cell sent for itself and the cells below it in the tree.
 
     Attributes:
@@ -201,20 +209,6 @@ class Sums:
     words: Words
     step: float
     names: tuple[str, ...]
-
-    def __len__(self) -> int:
-        return len(self.at_ns)
-
-    @property
-    def values(self) -> Floats:
-        """The sums in Nm or N, [n, joints of the chain]."""
-        values: Floats = self.words * np.float64(self.step)
-        return values
-
-    @property
-    def saturated(self) -> Bools:
-        """True for words that stand for any larger sum, [n, joints of the chain]."""
-        return _is_saturated(self.words)
 
     def to_pandas(self) -> pandas.DataFrame:
         """Returns a table with a column for each joint."""

@@ -198,7 +198,7 @@ class Lateness:
 
 @dataclass(frozen=True, kw_only=True)
 class Report(Event):
-    """State of the bench, on request. Positions and torques have shape (joints,)."""
+    """State of the bench, on request. Positions and torques have shape (joints,); empty while they are unknown."""
 
     id: Id = None
     buses: tuple[BusReport, ...] = field(default=(), metadata={"of": BusReport})
