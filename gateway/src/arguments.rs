@@ -137,23 +137,16 @@ pub(crate) fn find_cell(skin: &Skin, name: &CellName, option: &str) -> Result<us
             names()
         )));
     }
-    let there: Vec<_> = skin
-        .cells
-        .iter()
-        .enumerate()
-        .filter_map(|(index, cell)| {
-            let bus = skin.buses.get(cell.bus)?;
-            name.matches_cell(&bus.name, cell.node).then_some((index, bus))
-        })
-        .collect();
+    let there: Vec<_> = skin.cells_named(name).collect();
     match there.as_slice() {
         [(index, _)] => Ok(*index),
         [] => Err(Failure::usage_error(format!(
             "{option} {node}: the skin has no such cell on {}",
             bus.clone().unwrap_or_else(names)
         ))),
-        buses => {
-            let choices = comma_separated(buses.iter().map(|(_, bus)| format!("{}:{node}", bus.name)));
+        cells => {
+            let choices = cells.iter().map(|(_, cell)| skin.full_cell_name(cell.bus, cell.node));
+            let choices = comma_separated(choices.map(|name| name.to_string()));
             Err(Failure::usage_error(format!("{option} {node} is on several buses: choose one of {choices}")))
         }
     }

@@ -16,7 +16,7 @@
 //!
 //! [`control`] is the same for programs: commands on standard input, events on standard output.
 //!
-//! [`live`], [`pressed`], [`scene`], [`still`], [`surface`], [`command`] and [`tape`] use neither sockets nor clocks.
+//! [`live`], [`pressed`], [`scene`], [`still`], [`surface`], [`command`], [`page_command`] and [`tape`] use neither sockets nor clocks.
 //! [`server`], [`serve`] and [`play`] do the input and output for them.
 
 pub mod command;
@@ -24,6 +24,7 @@ pub mod control;
 mod followed;
 pub mod index;
 pub mod live;
+pub mod page_command;
 pub mod play;
 pub mod player;
 pub mod pressed;

@@ -160,13 +160,11 @@ impl LiveState {
         self.buses.iter_mut().for_each(|bus| drop(bus.handle_time(now)));
     }
 
-    /// Returns the bus index and node id of a cell if it may be pressed: it belongs to the skin and has reported test
-    /// mode.
+    /// Returns true if a cell may be pressed: it belongs to the skin and has reported test mode.
     #[must_use]
-    pub fn pressable_cell(&self, bus: usize, node: u8) -> Option<CellKey> {
-        let node = CellId::new(node.into()).ok()?;
-        let cell = self.buses.get(bus)?.cell(node)?;
-        (cell.is_measuring() == Some(false)).then_some((bus, node))
+    pub fn is_pressable(&self, (bus, node): CellKey) -> bool {
+        let cell = self.buses.get(bus).and_then(|bus| bus.cell(node));
+        cell.is_some_and(|cell| cell.is_measuring() == Some(false))
     }
 
     /// Returns the sensor values of the stimulus that a cell has latched, as far as the frames on the bus show it.

@@ -10,9 +10,9 @@ use std::time::{Duration, Instant};
 use protocol::skin::Skin;
 use trace::capture::Reader;
 
-use crate::command::Command;
 use crate::index::Progress;
 use crate::live::StatusMessage;
+use crate::page_command::{PageCommand, PlaybackCommand};
 use crate::player::{PlayError, Player};
 use crate::pressed::TouchRegistry;
 use crate::scene::Scene;
@@ -95,15 +95,20 @@ fn publish_and_execute(player: &mut Player, server: &Server, stop: &AtomicBool) 
     let mut marks = (usize::MAX, BTreeMap::new());
     while !stop.load(Ordering::Relaxed) {
         let mut failed = None;
-        let commands: Vec<_> = server.commands().map(|(_, command)| command).collect();
+        // The cells of a recording cannot be pressed or halted.
+        let commands = server.commands().filter_map(|(_, command)| match command {
+            PageCommand::Playback(command) => Some(command),
+            PageCommand::Control(_) | PageCommand::Select(_) => None,
+        });
+        let commands: Vec<_> = commands.collect();
         let mut is_changed = !commands.is_empty();
         for (place, command) in commands.iter().enumerate() {
             // A slider sends many positions. Only the last of consecutive ones is used.
-            let is_passed = matches!(commands.get(place + 1), Some(Command::Seek { .. }));
-            if matches!(command, Command::Seek { .. }) && is_passed {
+            let is_passed = matches!(commands.get(place + 1), Some(PlaybackCommand::Seek { .. }));
+            if matches!(command, PlaybackCommand::Seek { .. }) && is_passed {
                 continue;
             }
-            failed = execute_command(player, command).err().or(failed);
+            failed = execute_command(player, *command).err().or(failed);
         }
         let elapsed = std::mem::replace(&mut before, Instant::now()).elapsed();
         match player.advance_time(elapsed) {
@@ -134,7 +139,7 @@ fn publish_and_execute(player: &mut Player, server: &Server, stop: &AtomicBool) 
                 let text = |said: &StatusMessage| serde_json::to_string(said).unwrap_or_default();
                 let all = text(&said);
                 let own = server.selected_cells().into_iter().map(|(page, chosen)| {
-                    said.detail = live.cell_detail(chosen, now);
+                    said.detail = live.cell_detail(&chosen, now);
                     (page, text(&said))
                 });
                 (all, own.collect())
@@ -149,28 +154,20 @@ fn publish_and_execute(player: &mut Player, server: &Server, stop: &AtomicBool) 
     }
 }
 
-/// Executes a command of a page.
-fn execute_command(player: &mut Player, command: &Command) -> Result<(), String> {
-    let done = match *command {
-        Command::Play { speed } => {
+/// Executes a command of a page to the player.
+fn execute_command(player: &mut Player, command: PlaybackCommand) -> Result<(), String> {
+    let done = match command {
+        PlaybackCommand::Play { speed } => {
             player.play(speed);
             Ok(())
         }
-        Command::Pause => {
+        PlaybackCommand::Pause {} => {
             player.pause();
             Ok(())
         }
-        Command::Seek { at_s } => player.seek(at_s),
-        Command::Step { forward } => player.step_epoch(forward),
-        Command::Jump { to, forward } => player.jump_to_event(to, forward).map(|_| ()),
-        // The cells of a recording cannot be pressed or halted. The server handles the remaining commands.
-        Command::Press { .. }
-        | Command::Release
-        | Command::Halt
-        | Command::Resume
-        | Command::Bench(_)
-        | Command::Choose(_)
-        | Command::Unchoose => Ok(()),
+        PlaybackCommand::Seek { at_s } => player.seek(at_s),
+        PlaybackCommand::Step { forward } => player.step_epoch(forward),
+        PlaybackCommand::Jump { to, forward } => player.jump_to_event(to, forward).map(|_| ()),
     };
     done.map_err(|error| error.to_string())
 }

@@ -17,10 +17,11 @@ use protocol::message::{Message, SensorPage, StimulusStart};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
-use crate::command::Command;
+use crate::command::ControlCommand;
 use crate::followed::{BusOpener, FollowedBus, time_of_read_frames};
 use crate::live::{LiveState, StatusMessage};
 use crate::lock_ignoring_poison;
+use crate::page_command::PageCommand;
 use crate::player::PlayError;
 use crate::pressed::TouchRegistry;
 use crate::scene::Scene;
@@ -133,11 +134,19 @@ fn publish_and_execute(
     let mut number = 0_u64;
     while !stop.load(Ordering::Relaxed) {
         for (page, command) in server.commands() {
-            let Command::Bench(command) = command else {
-                execute_command(page, &command, &lock_ignoring_poison(live), &mut pressed, buses);
-                continue;
+            let is_done = match command {
+                PageCommand::Control(command) => {
+                    let live = lock_ignoring_poison(live);
+                    match command.bench_command(live.skin()) {
+                        None => execute_command(page, &command, &live, &mut pressed, buses),
+                        Some(Ok(command)) => bench.as_mut().is_some_and(|run| run.send(&command)),
+                        Some(Err(_)) => false,
+                    }
+                }
+                // The server handles selections, and there is no recording to be played.
+                PageCommand::Select(_) | PageCommand::Playback(_) => false,
             };
-            if !bench.as_mut().is_some_and(|run| run.send(&command)) {
+            if !is_done {
                 server.count_ignored_command();
             }
         }
@@ -160,8 +169,9 @@ fn publish_and_execute(
                     let mut said = StatusMessage { bench: seen(None), ..live.status_message(now) };
                     let all = to_json(&said);
                     let own = server.selected_cells().into_iter().map(|(page, chosen)| {
-                        said.bench = seen(Some((chosen.bus, chosen.node)));
-                        said.detail = live.cell_detail(chosen, now);
+                        let cell = chosen.cell.find(live.skin()).ok();
+                        said.bench = seen(cell.map(|(bus, node)| (bus, node.get())));
+                        said.detail = live.cell_detail(&chosen, now);
                         (page, to_json(&said))
                     });
                     (all, own.collect::<BTreeMap<_, _>>())
@@ -188,30 +198,37 @@ fn to_json(said: &StatusMessage) -> String {
     serde_json::to_string(said).unwrap_or_default()
 }
 
+/// Executes a command of a page on the buses. Returns false if the skin has no such cell, or if the command is not one
+/// of a page.
 fn execute_command(
     page: u64,
-    command: &Command,
+    command: &ControlCommand,
     live: &LiveState,
     pressed: &mut TouchRegistry,
     buses: &[FollowedBus],
-) {
+) -> bool {
     let everywhere = |message: &Message| buses.iter().for_each(|bus| _ = bus.send(message));
-    match *command {
-        Command::Press { bus, node, force_n } => match live.pressable_cell(bus, node) {
-            Some(cell) => pressed.press(page, cell, force_n),
-            None => pressed.release(page),
-        },
-        Command::Release => pressed.release(page),
-        Command::Halt => everywhere(&Message::Halt),
-        Command::Resume => everywhere(&Message::Resume),
-        // The server handles selections, the bench handles its own commands, and there is no recording to be played.
-        Command::Choose(_)
-        | Command::Unchoose
-        | Command::Bench(_)
-        | Command::Play { .. }
-        | Command::Pause
-        | Command::Seek { .. }
-        | Command::Step { .. }
-        | Command::Jump { .. } => {}
+    match command {
+        ControlCommand::Press { cell, force_n } => {
+            let cell = cell.find(live.skin()).ok().filter(|&cell| live.is_pressable(cell));
+            match cell {
+                Some(cell) => pressed.press(page, cell, *force_n),
+                None => pressed.release(page),
+            }
+            return cell.is_some();
+        }
+        ControlCommand::Release { .. } => pressed.release(page),
+        ControlCommand::Halt {} => everywhere(&Message::Halt),
+        ControlCommand::Resume {} => everywhere(&Message::Resume),
+        ControlCommand::Kill { .. }
+        | ControlCommand::Stop { .. }
+        | ControlCommand::Continue { .. }
+        | ControlCommand::Restart { .. }
+        | ControlCommand::Bus { .. }
+        | ControlCommand::Link { .. }
+        | ControlCommand::Epochs { .. }
+        | ControlCommand::Report {}
+        | ControlCommand::End {} => return false,
     }
+    true
 }

@@ -19,8 +19,8 @@ use std::thread;
 
 use tungstenite::{Bytes, Utf8Bytes};
 
-use crate::command::{Command, SelectedCell};
 use crate::lock_ignoring_poison;
+use crate::page_command::{PageCommand, SelectedCell};
 use crate::token::Token;
 
 /// The maximum number of pages at the same time.
@@ -77,7 +77,7 @@ struct ServerState {
     newest: Mutex<LatestMessages>,
     chosen: Mutex<BTreeMap<u64, SelectedCell>>,
     gone: Mutex<Vec<u64>>,
-    commands: SyncSender<(u64, Command)>,
+    commands: SyncSender<(u64, PageCommand)>,
     stop: AtomicBool,
     pages: AtomicUsize,
     clients: AtomicU64,
@@ -89,7 +89,7 @@ struct ServerState {
 #[derive(Debug)]
 pub struct Server {
     shared: Arc<ServerState>,
-    commands: Receiver<(u64, Command)>,
+    commands: Receiver<(u64, PageCommand)>,
 }
 
 impl Server {
@@ -158,7 +158,7 @@ impl Server {
     }
 
     /// Returns the commands that pages have sent since the last call, each with the number of the page.
-    pub fn commands(&self) -> impl Iterator<Item = (u64, Command)> + '_ {
+    pub fn commands(&self) -> impl Iterator<Item = (u64, PageCommand)> + '_ {
         self.commands.try_iter()
     }
 

@@ -1,6 +1,6 @@
 // The page: keeps the newest messages, and draws when something has changed.
 
-import { Bench } from "./bench.js";
+import { Bench, nameOf } from "./bench.js";
 import { Camera } from "./camera.js";
 import { SHOWS, css, ramp } from "./colours.js";
 import { hold } from "./frames.js";
@@ -58,7 +58,7 @@ function draw(ratio) {
   return { drew, worked: news !== null };
 }
 
-const name = (i) => (i < 0 ? "" : `${scene.buses[scene.cells[i].bus].name}:${scene.cells[i].node}`);
+const name = (i) => (i < 0 ? "" : nameOf(scene, scene.cells[i]));
 
 function choose(i) {
   if (i === chosen) return;
@@ -66,7 +66,7 @@ function choose(i) {
   words.chosen(name(i));
   $("search").value = name(i);
   $("hold").disabled = i < 0 || !scene.may_press;
-  link.send(i < 0 ? { do: "unchoose" } : { do: "choose", bus: scene.cells[i].bus, node: scene.cells[i].node });
+  link.send(i < 0 ? { do: "unchoose" } : { do: "choose", cell: name(i) });
   redraw();
 }
 
@@ -74,7 +74,7 @@ function press(i) {
   choose(i);
   if (!scene.may_press) return;
   pressed = i;
-  link.send({ do: "press", bus: scene.cells[i].bus, node: scene.cells[i].node, force_n: Number($("force").value) });
+  link.send({ do: "press", cell: name(i), force_n: Number($("force").value) });
 }
 
 function release() {
@@ -141,7 +141,7 @@ const time = new TimeBar($("time"), (command) => link.send(command));
 
 // Requests the explanation of the torque in a frame of the chosen cell.
 function ask(frame) {
-  link.send({ do: "choose", bus: scene.cells[chosen].bus, node: scene.cells[chosen].node, frame });
+  link.send({ do: "choose", cell: name(chosen), frame });
 }
 
 listen(canvas, {

@@ -24,6 +24,9 @@ export function about(process) {
   return `${what} ${{ running: "is running", stopped: "is stopped", ended: "has ended" }[process.phase]}.`;
 }
 
+// The name of a cell in commands.
+export const nameOf = (scene, { bus, node }) => `${scene.buses[bus].name}:${node}`;
+
 export const isDown = (state, bus, one, other) =>
   state.links_down.some((link) => link.bus === bus && link.nodes[0] === Math.min(one, other) && link.nodes[1] === Math.max(one, other));
 
@@ -64,7 +67,7 @@ class Switch {
 
 export class Bench {
   constructor(send) {
-    this.send = (command) => send({ do: "bench", ...command });
+    this.send = send;
     this.parts = [];
   }
 
@@ -98,8 +101,7 @@ export class Bench {
     this.ofCell = element("div");
     this.process = element("p", undefined, "faint");
     this.actions = NAMES.map((action) => button(action[0].toUpperCase() + action.slice(1), () => {
-      const { bus, node } = this.cell;
-      this.send({ on: "process", action, bus, node });
+      this.send({ do: action, cell: nameOf(this.scene, this.cell) });
     }));
     const row = element("div", undefined, "row actions");
     row.append(...this.actions);
@@ -107,7 +109,7 @@ export class Bench {
     this.ofCell.append(element("h3", "Process"), this.process, row, this.links);
     $("cell").after(this.ofCell);
 
-    this.buses = scene.buses.map(({ name }, bus) => new Switch(name, `bus ${name}`, (down) => this.send({ on: "bus", down, bus })));
+    this.buses = scene.buses.map(({ name }) => new Switch(name, `bus ${name}`, (down) => this.send({ do: "bus", bus: name, down })));
     const buses = element("table", undefined, "switches");
     buses.append(...this.buses.map((it) => it.row));
     $("buses").after(buses);
@@ -127,7 +129,7 @@ export class Bench {
       this.cell = cell;
       const wired = cell && state.buses[cell.bus].links ? cell.neighbors : [];
       this.neighbors = wired.map((other) => [other, new Switch(`to cell ${other}`, `the link between cells ${cell.node} and ${other}`,
-        (down) => this.send({ on: "link", down, bus: cell.bus, nodes: [cell.node, other] }))]);
+        (down) => this.send({ do: "link", cells: [cell, { bus: cell.bus, node: other }].map((it) => nameOf(scene, it)), down }))]);
       const table = element("table", undefined, "switches");
       table.append(...this.neighbors.map(([, it]) => it.row));
       this.links.replaceChildren(...(wired.length ? [element("h3", "Links"), table] : []));

@@ -97,17 +97,12 @@ impl Page {
     }
 
     pub fn press(&mut self, node: u8, force_n: f64) {
-        self.send(&format!(r#"{{"do":"press","bus":0,"node":{node},"force_n":{force_n}}}"#));
+        self.send(&format!(r#"{{"do":"press","cell":{node},"force_n":{force_n}}}"#));
     }
 
-    /// Sends a command to the bench, given as JSON fields such as `"on":"bus","down":true,"bus":0`.
-    pub fn command(&mut self, command: &str) {
-        self.send(&format!(r#"{{"do":"bench",{command}}}"#));
-    }
-
-    /// Sends an action on the process of a cell on the first bus.
+    /// Sends an action on the process of a cell.
     pub fn act(&mut self, action: &str, node: u8) {
-        self.command(&format!(r#""on":"process","action":"{action}","bus":0,"node":{node}"#));
+        self.send(&format!(r#"{{"do":"{action}","cell":{node}}}"#));
     }
 
     /// Waits for the answer to a command with this text; returns true if the command was carried out.

@@ -27,7 +27,7 @@ fn a_press_is_a_torque_and_a_release_takes_it_away() {
     );
     let rest = page.wait_for_snapshot("all cells quiet", |it| it.cells.iter().all(|cell| cell.0 == 1));
     assert!(rest.cells.iter().all(|cell| cell.1 == 0 && cell.2 == 0));
-    page.send(r#"{"do":"choose","bus":0,"node":5}"#);
+    page.send(r#"{"do":"choose","cell":5}"#);
     page.press(5, 6.0);
     let pressed =
         page.wait_for_snapshot("the torque of the cell", |it| it.joints.iter().any(|joint| joint[1] != 0.0));
@@ -121,16 +121,13 @@ fn who_is_no_page_of_this_server_is_refused_and_floods_end_nothing() {
     let flooding = std::thread::spawn(move || {
         for number in 0..100_000_u32 {
             let text = match number % 8 {
-                0 => "{\"do\":\"press\",\"bus\":9,\"node\":1,\"force_n\":1}".to_owned(),
-                1 => format!("{{\"do\":\"choose\",\"bus\":0,\"node\":{}}}", number % 256),
+                0 => "{\"do\":\"press\",\"cell\":\"vcan9:1\",\"force_n\":1}".to_owned(),
+                1 => format!("{{\"do\":\"choose\",\"cell\":{}}}", number % 256),
                 2 => "x".repeat(200),
-                3 => "{\"do\":\"press\",\"bus\":0,\"node\":2,\"force_n\":1e308}".to_owned(),
-                4 => "{\"do\":\"bench\",\"on\":\"process\",\"action\":\"kill\",\"bus\":9,\"node\":1}"
-                    .to_owned(),
-                5 => "{\"do\":\"bench\",\"on\":\"link\",\"down\":true,\"bus\":0,\"nodes\":[1,1]}".to_owned(),
-                6 => {
-                    "{\"do\":\"bench\",\"on\":\"bus\",\"down\":false,\"bus\":18446744073709551615}".to_owned()
-                }
+                3 => "{\"do\":\"press\",\"cell\":2,\"force_n\":1e308}".to_owned(),
+                4 => "{\"do\":\"kill\",\"cell\":\"vcan9:1\"}".to_owned(),
+                5 => "{\"do\":\"link\",\"cells\":[1,1],\"down\":true}".to_owned(),
+                6 => "{\"do\":\"bus\",\"bus\":\"vcan9\",\"down\":false}".to_owned(),
                 _ => "{\"do\":\"release\"}".to_owned(),
             };
             if flood.socket.send(Message::text(text)).is_err() {

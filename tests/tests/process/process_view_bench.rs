@@ -37,7 +37,7 @@ fn a_page_kills_stops_and_restarts_cells() {
     let (run, address) = watched(&place, 6, "--record run.mcap");
     let mut page = Page::new(&address);
     page.wait_for_snapshot("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
-    page.send(r#"{"do":"choose","bus":0,"node":5}"#);
+    page.send(r#"{"do":"choose","cell":5}"#);
     let running = json!([{ "bus": 0, "nodes": [5, 5], "phase": "running" }]);
     let said = page.wait_for_status("its process", |said| said["bench"]["processes"] == running);
     assert_eq!(said["bench"]["buses"], json!([{ "down": false, "links": false }]));
@@ -51,7 +51,6 @@ fn a_page_kills_stops_and_restarts_cells() {
     for (action, node, why) in [
         ("kill", 5, "kill cell 5 on vcan0: the process has ended: restart it"),
         ("continue", 2, "continue cell 2 on vcan0: the process is running"),
-        ("stop", 200, "stop cell 200 on vcan0: the skin has no such cell"),
     ] {
         page.act(action, node);
         assert!(!page.answer(why), "{why}");
@@ -70,14 +69,10 @@ fn a_page_kills_stops_and_restarts_cells() {
     assert_eq!(run.cell(5), back);
 
     for (command, why) in [
-        (
-            r#""on":"link","down":true,"bus":0,"nodes":[1,2]"#,
-            "link down between cell 1 and cell 2 on vcan0: ",
-        ),
-        (r#""on":"bus","down":true,"bus":7"#, "the skin has no such bus"),
-        (r#""on":"bus","down":false,"bus":0"#, "bus vcan0 up: no command has taken it down"),
+        (r#"{"do":"link","cells":[1,2],"down":true}"#, "link down between cell 1 and cell 2 on vcan0: "),
+        (r#"{"do":"bus","bus":"vcan0","down":false}"#, "bus vcan0 up: no command has taken it down"),
     ] {
-        page.command(command);
+        page.send(command);
         assert!(!page.answer(why), "{why}");
     }
     let said = page.wait_for_status("a full second", |said| {
@@ -105,7 +100,7 @@ fn a_process_of_several_cells_is_acted_on_as_a_whole() {
     let (run, address) = watched(&place, 6, "--cells-per-process 4");
     let mut page = Page::new(&address);
     page.wait_for_snapshot("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
-    page.send(r#"{"do":"choose","bus":0,"node":3}"#);
+    page.send(r#"{"do":"choose","cell":3}"#);
     page.wait_for_status("its process", |said| said["bench"]["processes"][0]["nodes"] == json!([1, 4]));
     page.act("kill", 3);
     assert!(page.answer("kill cells 1 to 4 on vcan0"));
@@ -127,7 +122,7 @@ fn a_bus_that_a_page_takes_down_stays_down_until_it_takes_it_up() {
     page.wait_for_snapshot("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
     let served = || place.processes().iter().any(|(_, line)| line.contains("vcan-setup serve"));
     assert!(served());
-    page.command(r#""on":"bus","down":true,"bus":0"#);
+    page.send(r#"{"do":"bus","bus":"vcan0","down":true}"#);
     assert!(page.answer("bus vcan0 down"));
     page.wait_for_status("the bus down", |said| {
         said["buses"][0]["up"] == false && said["bench"]["buses"][0]["down"] == true
@@ -137,10 +132,10 @@ fn a_bus_that_a_page_takes_down_stays_down_until_it_takes_it_up() {
     let said = page.wait_for_status("why it is halted", |said| why(said).is_some());
     assert!(run.stderr().contains(&format!("the robot is halted: {};", why(&said).unwrap())), "{said}");
     assert!(!served(), "it is not served again by itself");
-    page.command(r#""on":"bus","down":true,"bus":0"#);
+    page.send(r#"{"do":"bus","bus":"vcan0","down":true}"#);
     assert!(!page.answer("it is already down"));
 
-    page.command(r#""on":"bus","down":false,"bus":0"#);
+    page.send(r#"{"do":"bus","bus":"vcan0","down":false}"#);
     assert!(page.answer("bus vcan0 up"));
     run.wait_for_stderr("vcan0 works again");
     page.wait_for_status("the bus up", |said| {
@@ -154,7 +149,7 @@ fn a_bus_that_a_page_takes_down_stays_down_until_it_takes_it_up() {
     page.send(r#"{"do":"release"}"#);
 
     // As after any other loss: a bus that is down at the end is a bus that the run has lost.
-    page.command(r#""on":"bus","down":true,"bus":0"#);
+    page.send(r#"{"do":"bus","bus":"vcan0","down":true}"#);
     page.wait_for_status("the bus down again", |said| said["buses"][0]["up"] == false);
     assert_eq!(end(&place, run), Some(1));
     assert_eq!(place.summary().0["buses"][0]["outages"]["times"], 2);
@@ -171,7 +166,7 @@ fn a_bus_that_a_page_takes_down_and_up_at_once_is_no_loss_of_the_run() {
     for times in [1, 1, 2, 3] {
         let seen = run.stderr().matches("vcan0 works again").count();
         for down in [true, false].repeat(times) {
-            page.command(&format!(r#""on":"bus","down":{down},"bus":0"#));
+            page.send(&format!(r#"{{"do":"bus","bus":"vcan0","down":{down}}}"#));
         }
         (0..times).for_each(|_| assert!(page.answer("bus vcan0 down") && page.answer("bus vcan0 up")));
         until("the bus", || (run.stderr().matches("vcan0 works again").count() > seen).then_some(()));
@@ -224,18 +219,17 @@ fn a_link_that_a_page_takes_down_leaves_a_cell_unreachable() {
     let mut page = Page::new(&address);
     let said = page.wait_for_status("the bench", |said| said["bench"].is_object());
     assert_eq!(said["bench"]["buses"], json!([{ "down": false, "links": true }]));
-    let link = |down: bool, one: u8, other: u8| {
-        format!(r#""on":"link","down":{down},"bus":0,"nodes":[{one},{other}]"#)
-    };
-    page.command(&link(true, 1, 12));
+    let link =
+        |down: bool, one: u8, other: u8| format!(r#"{{"do":"link","cells":[{one},{other}],"down":{down}}}"#);
+    page.send(&link(true, 1, 12));
     assert!(!page.answer("link down between cell 1 and cell 12 on vcan0: the skin has no wire between them"));
-    page.command(&link(true, 4, 3));
-    page.command(&link(true, 8, 4));
+    page.send(&link(true, 4, 3));
+    page.send(&link(true, 8, 4));
     run.wait_for_stderr("view: link down between cell 4 and cell 3 on vcan0");
     run.wait_for_stderr("cell 4 on vcan0 has had no route to the gateway for ");
     let down = json!([{ "bus": 0, "nodes": [3, 4] }, { "bus": 0, "nodes": [4, 8] }]);
     page.wait_for_status("both links", |said| said["bench"]["links_down"] == down);
-    page.command(&link(false, 3, 4));
+    page.send(&link(false, 3, 4));
     run.wait_for_stderr("cell 4 on vcan0 has a route to the gateway again, after");
     page.wait_for_status("one link", |said| {
         said["bench"]["links_down"] == json!([{ "bus": 0, "nodes": [4, 8] }])
@@ -263,7 +257,7 @@ fn a_server_that_hangs_or_ends_does_not_hold_the_run_up() {
     signal(server, Signal::CONT);
     assert!(page.answer("kill cell 2 on vcan0"));
     // After the page has gone, no client can bring the bus up again.
-    page.command(r#""on":"bus","down":true,"bus":0"#);
+    page.send(r#"{"do":"bus","bus":"vcan0","down":true}"#);
     assert!(page.answer("bus vcan0 down"));
     signal(server, Signal::KILL);
     run.wait_for_stderr(

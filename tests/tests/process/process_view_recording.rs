@@ -78,10 +78,10 @@ fn agrees_with_dump(names: &[&str], more: &str) {
         let torques = torques(&dumped);
         compared += torques.len();
         for ((bus, node), (epoch, words)) in torques {
+            recording.page.send(&format!(r#"{{"do":"choose","cell":"{bus}:{node}"}}"#));
             let index =
                 recording.page.scene["buses"].as_array().unwrap().iter().position(|it| it["name"] == bus);
             let bus = index.unwrap();
-            recording.page.send(&format!(r#"{{"do":"choose","bus":{bus},"node":{node}}}"#));
             let said = recording.page.wait_for_status("the cell", |said| {
                 said["detail"]["node"] == node && said["detail"]["bus"] == bus
             });
@@ -161,10 +161,10 @@ fn pages_play_and_nothing_they_send_ends_it() {
         r#"{"do":"play","speed":-3}"#,
         r#"{"do":"jump","to":"nothing","forward":true}"#,
         r#"{"do":"step"}"#,
-        r#"{"do":"press","bus":0,"node":1,"force_n":5}"#,
+        r#"{"do":"press","cell":1,"force_n":5}"#,
         r#"{"do":"halt"}"#,
-        r#"{"do":"choose","bus":99,"node":1,"frame":18446744073709551615}"#,
-        r#"{"do":"choose","bus":0,"node":1,"frame":0}"#,
+        r#"{"do":"choose","cell":"vcan99:1","frame":18446744073709551615}"#,
+        r#"{"do":"choose","cell":1,"frame":0}"#,
     ] {
         page.send(wrong);
     }

@@ -159,7 +159,7 @@ fn a_page_takes_an_interface_down_and_up() {
     let (run, address) = watched_skin(&place, "");
     let mut page = Page::new(&address);
     page.wait_for_snapshot("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
-    page.command(r#""on":"bus","down":true,"bus":0"#);
+    page.send(r#"{"do":"bus","bus":"vcan0","down":true}"#);
     assert!(page.answer("bus vcan0 down"));
     let is_up = || {
         let shown: Value = serde_json::from_slice(&tool("ip -json link show vcan0").stdout).unwrap();
@@ -172,7 +172,7 @@ fn a_page_takes_an_interface_down_and_up() {
     page.wait_for_snapshot("silent cells", |it| it.cells.iter().all(|cell| cell.0 == 4));
     let said = page.wait_for_status("words", |_| true);
     assert_eq!(said["buses"][0]["up"], false, "frames from before are no sign that it works again");
-    page.command(r#""on":"bus","down":false,"bus":0"#);
+    page.send(r#"{"do":"bus","bus":"vcan0","down":false}"#);
     assert!(page.answer("bus vcan0 up"));
     assert!(is_up());
     run.wait_for_stderr("vcan0 works again");

@@ -2,11 +2,10 @@
 
 use std::io::{self, BufRead};
 
-use model::scenario::ProcessAction;
-use serde::{Deserialize, Deserializer, de};
 use serde_json::Value;
 
 use super::event::RequestId;
+use crate::command::ControlCommand;
 use crate::pressed::MAX_FORCE_N;
 
 /// The maximum length of a line in bytes, without its end.
@@ -35,130 +34,6 @@ pub struct Request {
     pub id: Option<RequestId>,
     /// The command.
     pub command: ControlCommand,
-}
-
-/// A cell as a command names it: a node id as a number, or the text `NODE` or `BUS:NODE`.
-#[derive(Clone, Debug, Eq, PartialEq)]
-pub struct CellReference(pub String);
-
-/// A command to a run.
-#[derive(Clone, Debug, Deserialize, PartialEq)]
-#[serde(tag = "do", rename_all = "lowercase", deny_unknown_fields)]
-pub enum ControlCommand {
-    /// Presses a cell.
-    Press {
-        /// The cell.
-        cell: CellReference,
-        /// The force in N, 0 to [`MAX_FORCE_N`].
-        force_n: f64,
-    },
-    /// Releases a cell, or all cells that this program presses.
-    Release {
-        /// The cell; `None` for all.
-        #[serde(default)]
-        cell: Option<CellReference>,
-    },
-    /// Halts all cells.
-    Halt {},
-    /// Lets all halted cells continue.
-    Resume {},
-    /// Kills the process of a cell.
-    Kill {
-        /// The cell.
-        cell: CellReference,
-    },
-    /// Stops the process of a cell.
-    Stop {
-        /// The cell.
-        cell: CellReference,
-    },
-    /// Lets the stopped process of a cell continue.
-    Continue {
-        /// The cell.
-        cell: CellReference,
-    },
-    /// Starts the process of a cell again.
-    Restart {
-        /// The cell.
-        cell: CellReference,
-    },
-    /// Takes a bus down, or brings it up.
-    Bus {
-        /// The name of the bus.
-        bus: String,
-        /// True to take it down.
-        down: bool,
-    },
-    /// Takes the link between two cells down, or brings it up.
-    Link {
-        /// The two cells, of one bus.
-        cells: [CellReference; 2],
-        /// True to take it down.
-        down: bool,
-    },
-    /// Requests an event for every Nth epoch.
-    Epochs {
-        /// N; 0 ends the events.
-        every: u32,
-    },
-    /// Requests the state of the bench.
-    Report {},
-    /// Ends the run in order.
-    End {},
-}
-
-impl ControlCommand {
-    /// Returns the name of the command.
-    #[must_use]
-    pub const fn name(&self) -> &'static str {
-        match self {
-            Self::Press { .. } => "press",
-            Self::Release { .. } => "release",
-            Self::Halt {} => "halt",
-            Self::Resume {} => "resume",
-            Self::Kill { .. } => "kill",
-            Self::Stop { .. } => "stop",
-            Self::Continue { .. } => "continue",
-            Self::Restart { .. } => "restart",
-            Self::Bus { .. } => "bus",
-            Self::Link { .. } => "link",
-            Self::Epochs { .. } => "epochs",
-            Self::Report {} => "report",
-            Self::End {} => "end",
-        }
-    }
-
-    /// Returns the action on a cell's process, and the cell; `None` for other commands.
-    #[must_use]
-    pub const fn process_action(&self) -> Option<(ProcessAction, &CellReference)> {
-        match self {
-            Self::Kill { cell } => Some((ProcessAction::Kill, cell)),
-            Self::Stop { cell } => Some((ProcessAction::Stop, cell)),
-            Self::Continue { cell } => Some((ProcessAction::Continue, cell)),
-            Self::Restart { cell } => Some((ProcessAction::Restart, cell)),
-            Self::Press { .. }
-            | Self::Release { .. }
-            | Self::Halt {}
-            | Self::Resume {}
-            | Self::Bus { .. }
-            | Self::Link { .. }
-            | Self::Epochs { .. }
-            | Self::Report {}
-            | Self::End {} => None,
-        }
-    }
-}
-
-impl<'de> Deserialize<'de> for CellReference {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        match Value::deserialize(deserializer)? {
-            Value::Number(number) => Ok(Self(number.to_string())),
-            Value::String(text) => Ok(Self(text)),
-            other @ (Value::Null | Value::Bool(_) | Value::Array(_) | Value::Object(_)) => {
-                Err(de::Error::custom(format!("cell {other}: use a node id or \"BUS:NODE\"")))
-            }
-        }
-    }
 }
 
 impl InputLine {
@@ -265,6 +140,7 @@ pub(super) fn read_line(input: &mut impl BufRead) -> io::Result<Option<InputLine
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::command::CellReference;
     use proptest::prelude::*;
 
     fn command(text: &str) -> Option<ControlCommand> {
@@ -303,7 +179,7 @@ mod tests {
         }
         for name in ["kill", "stop", "continue", "restart"] {
             let read = command(&format!(r#"{{"do":"{name}","cell":5}}"#)).unwrap();
-            assert_eq!((read.name(), read.process_action().unwrap().0.name()), (name, name));
+            assert_eq!(read.name(), name);
         }
     }
 

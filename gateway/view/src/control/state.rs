@@ -8,13 +8,14 @@ use model::scenario::contact_words;
 use protocol::can::Frame;
 use protocol::id::CellId;
 use protocol::message::{Message, SkinSensors};
-use protocol::skin::{CellName, Skin};
+use protocol::skin::Skin;
 use protocol::time::Micros;
 
 use super::bus::ControlBus;
 use super::event::{AskedStimulus, ControlEvent, JointTorques, ReadyBus, ReportedBus, RequestId};
 use super::presses::Press;
-use super::request::{CellReference, ControlCommand, InputLine, Request};
+use super::request::{InputLine, Request};
+use crate::command::ControlCommand;
 
 /// The maximum number of commands that the run carries out at once. It keeps more answers than that.
 const MAX_COMMANDS_IN_FLIGHT: usize = 4;
@@ -235,7 +236,7 @@ impl ControlState {
         while self.is_ready
             && let Some(line) = self.waiting.front()
         {
-            let is_for_run = matches!(line, InputLine::Request(request) if self.bench_command(&request.command).is_some_and(|it| it.is_ok()));
+            let is_for_run = matches!(line, InputLine::Request(request) if request.command.bench_command(&self.skin).is_some_and(|it| it.is_ok()));
             let in_flight = self.in_flight.len();
             if in_flight >= MAX_COMMANDS_IN_FLIGHT || in_flight > 0 && !is_for_run {
                 return;
@@ -262,7 +263,7 @@ impl ControlState {
             return self.output.events.push(ControlEvent::Error { id, text: "the run is ending".to_owned() });
         }
         let name = command.name();
-        let done = match self.bench_command(&command) {
+        let done = match command.bench_command(&self.skin) {
             Some(Ok(bench)) => {
                 self.is_ending |= bench == BenchCommand::End;
                 self.output.commands.push(bench);
@@ -286,46 +287,6 @@ impl ControlState {
         }
     }
 
-    /// Returns the command for the run; `None` for commands that the channel carries out itself.
-    fn bench_command(&self, command: &ControlCommand) -> Option<Result<BenchCommand, String>> {
-        if let Some((action, cell)) = command.process_action() {
-            let cell = self.find_cell(cell);
-            return Some(cell.map(|(bus, node)| BenchCommand::Process { action, bus, node: node.get() }));
-        }
-        Some(match command {
-            ControlCommand::Bus { bus, down } => {
-                let found = self.skin.bus_index(bus);
-                let names =
-                    || self.skin.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
-                found
-                    .map(|bus| BenchCommand::Bus { down: *down, bus })
-                    .ok_or_else(|| format!("bus {bus:?}: the skin has no such bus; it has {}", names()))
-            }
-            ControlCommand::Link { cells: [one, other], down } => self
-                .find_cell(one)
-                .and_then(|one| Ok((one, self.find_cell(other)?)))
-                .and_then(|(one, other)| {
-                    if one.0 != other.0 {
-                        return Err(
-                            "the two cells are on different buses: name two cells of one bus".to_owned()
-                        );
-                    }
-                    Ok(BenchCommand::Link { down: *down, bus: one.0, nodes: [one.1.get(), other.1.get()] })
-                }),
-            ControlCommand::End {} => Ok(BenchCommand::End),
-            ControlCommand::Press { .. }
-            | ControlCommand::Release { .. }
-            | ControlCommand::Halt {}
-            | ControlCommand::Resume {}
-            | ControlCommand::Kill { .. }
-            | ControlCommand::Stop { .. }
-            | ControlCommand::Continue { .. }
-            | ControlCommand::Restart { .. }
-            | ControlCommand::Epochs { .. }
-            | ControlCommand::Report {} => return None,
-        })
-    }
-
     /// Carries out a command that is not for the run. Returns the action in words, unless the command has an event of
     /// its own.
     fn execute(
@@ -336,12 +297,12 @@ impl ControlState {
     ) -> Result<Option<String>, String> {
         match command {
             ControlCommand::Press { cell, force_n } => {
-                let cell = self.find_cell(cell)?;
+                let cell = cell.find(&self.skin)?;
                 self.press_and_answer((now, id, "press"), cell, *force_n)?;
                 Ok(None)
             }
             ControlCommand::Release { cell: Some(cell) } => {
-                let cell = self.find_cell(cell)?;
+                let cell = cell.find(&self.skin)?;
                 self.press_and_answer((now, id, "release"), cell, 0.0)?;
                 Ok(None)
             }
@@ -471,24 +432,8 @@ impl ControlState {
         ControlEvent::Report { id, buses, joints: all, cells, lateness_us, skipped }
     }
 
-    /// Finds the cell that a command names.
-    fn find_cell(&self, CellReference(text): &CellReference) -> Result<(usize, CellId), String> {
-        let name: CellName = text.parse().map_err(|error| format!("cell {text:?}: {error}"))?;
-        let on = |bus: usize| self.skin.buses.get(bus).map_or("", |bus| bus.name.as_str());
-        let mut found = self.skin.cells.iter().filter(|cell| name.matches_cell(on(cell.bus), cell.node));
-        match (found.next(), found.next()) {
-            (Some(cell), None) => Ok((cell.bus, cell.node)),
-            (None, _) => Err(format!("cell {name}: the skin has no such cell")),
-            (Some(one), Some(other)) => Err(format!(
-                "cell {name} is on several buses: name it with its bus, such as \"{}\" or \"{}\"",
-                self.cell_text(one.bus, one.node),
-                self.cell_text(other.bus, other.node)
-            )),
-        }
-    }
-
     fn cell_text(&self, bus: usize, node: CellId) -> String {
-        format!("{}:{node}", self.skin.buses.get(bus).map_or("", |bus| bus.name.as_str()))
+        self.skin.full_cell_name(bus, node).to_string()
     }
 }
 

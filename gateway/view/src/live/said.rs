@@ -3,7 +3,7 @@
 use bench::remote::BenchState;
 use model::table::{CellStatus, FrameEvent};
 use protocol::fixed::is_saturated;
-use protocol::id::{CellId, Id, Kind};
+use protocol::id::{Id, Kind};
 use protocol::message::{SensorPage, SensorReadings};
 use protocol::parameters::Contact;
 use protocol::schema::{FieldFormat, PacketSchema};
@@ -12,7 +12,7 @@ use serde::Serialize;
 
 use super::bus::LiveBus;
 use super::{DecodedFrame, LiveState, TorqueExplanation};
-use crate::command::SelectedCell;
+use crate::page_command::SelectedCell;
 use crate::player::PlayerStatus;
 
 /// The maximum number of dead cells that are listed by name.
@@ -231,10 +231,10 @@ impl LiveState {
 
     /// Returns the details of the cell that a page has selected; `None` if the skin does not have this cell.
     #[must_use]
-    pub fn cell_detail(&self, chosen: SelectedCell, now: Micros) -> Option<CellDetail> {
-        let SelectedCell { bus: index, node, frame } = chosen;
+    pub fn cell_detail(&self, chosen: &SelectedCell, now: Micros) -> Option<CellDetail> {
+        let SelectedCell { cell, frame } = chosen;
+        let (index, id) = cell.find(&self.skin).ok()?;
         let bus = self.buses.get(index)?;
-        let id = CellId::new(node.into()).ok()?;
         let place = bus.table.index_of(id)?;
         let cell = bus.table.cells().get(place)?;
         let (sensors, status) = bus.table.presumed_sensors(now).nth(place)?;
@@ -262,7 +262,7 @@ impl LiveState {
         let uplink = cell.uplink();
         Some(CellDetail {
             bus: index,
-            node,
+            node: id.get(),
             serial: cell.serial,
             status: status.name(),
             configuration: [

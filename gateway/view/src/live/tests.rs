@@ -1,7 +1,8 @@
 //! Tests of the state that results from generated frames.
 
 use super::*;
-use crate::command::SelectedCell;
+use crate::command::CellReference;
+use crate::page_command::SelectedCell;
 use model::generate::{ReplyMode, SkinRequest, generate};
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::Node;
@@ -12,6 +13,10 @@ use protocol::packet::{Epoch, Packet};
 
 fn skin() -> Skin {
     Skin::parse("ur5", include_str!("../../../examples/ur5-253.toml")).unwrap()
+}
+
+fn selected(cell: &str) -> SelectedCell {
+    SelectedCell { cell: CellReference(cell.to_owned()), frame: None }
 }
 
 /// The state of the example skin, whose frames are generated at 62.5 Hz.
@@ -106,7 +111,7 @@ fn a_snapshot_holds_the_last_epoch_that_is_over() {
     let said = bench.live.status_message(bench.now);
     // The start of the cell was not observed, so no reply of it was due.
     assert_eq!((said.contacts, said.dead, said.halted, said.buses[0].due), (1, 0, false, 0));
-    let detail = bench.live.cell_detail(SelectedCell { bus: 0, node: 5, frame: None }, bench.now).unwrap();
+    let detail = bench.live.cell_detail(&selected("5"), bench.now).unwrap();
     let answer = detail.torque.unwrap();
     assert_eq!((answer.epoch, answer.words[..2].to_vec(), detail.serial), (2, vec![100, -200], 100_005));
     let exact = answer.central.unwrap();
@@ -118,8 +123,9 @@ fn a_snapshot_holds_the_last_epoch_that_is_over() {
     assert_eq!(detail.gains.alpha[0], contact.alpha_c.to_f64());
     assert_eq!(detail.gains.thresholds[2], contact.force_threshold.to_f64());
     assert!((exact[0] - f64::from(central)).abs() < 1e-6, "the only cell in contact: {exact:?} {central}");
-    assert_eq!(bench.live.cell_detail(SelectedCell { bus: 0, node: 254, frame: None }, bench.now), None);
-    assert_eq!(bench.live.cell_detail(SelectedCell { bus: 7, node: 1, frame: None }, bench.now), None);
+    for other in ["254", "0", "vcan7:1", "five"] {
+        assert_eq!(bench.live.cell_detail(&selected(other), bench.now), None, "{other}");
+    }
 }
 
 #[test]
@@ -144,17 +150,13 @@ fn a_silent_cell_is_dead_since_it_was_noticed_and_a_halt_stands_until_the_resume
 #[test]
 fn only_cells_of_the_skin_in_test_mode_may_be_pressed() {
     let mut bench = Bench::new();
-    assert_eq!(bench.live.pressable_cell(0, 12), None, "it has not said that it is in test mode");
+    let cell = |node| CellId::new(node).unwrap();
+    assert!(!bench.live.is_pressable((0, cell(12))), "it has not reported test mode");
     bench.heartbeat(12, 0);
-    assert_eq!(bench.live.pressable_cell(0, 12), Some((0, CellId::new(12).unwrap())));
-    assert_eq!(
-        (
-            bench.live.pressable_cell(0, 0),
-            bench.live.pressable_cell(0, 254),
-            bench.live.pressable_cell(1, 12)
-        ),
-        (None, None, None)
-    );
+    assert!(bench.live.is_pressable((0, cell(12))));
+    for other in [(0, cell(254)), (1, cell(12))] {
+        assert!(!bench.live.is_pressable(other), "{other:?}");
+    }
 }
 
 #[test]

@@ -4,8 +4,9 @@
 use std::io::Write;
 
 use super::*;
-use crate::command::SelectedCell;
+use crate::command::CellReference;
 use crate::live::StatusMessage;
+use crate::page_command::SelectedCell;
 use crate::pressed::TouchRegistry;
 use proptest::prelude::*;
 use protocol::can::Format;
@@ -89,7 +90,7 @@ fn log(skin: &Skin) -> Vec<u8> {
 
 /// Returns the snapshot without its number, and the status.
 fn shown(tape: &mut LiveState, now: Micros) -> (Vec<u8>, String) {
-    let detail = tape.cell_detail(SelectedCell { bus: 0, node: 5, frame: None }, now);
+    let detail = tape.cell_detail(&SelectedCell { cell: CellReference("5".to_owned()), frame: None }, now);
     let said = StatusMessage { detail, ..tape.status_message(now) };
     (tape.snapshot(now, &TouchRegistry::default()).split_off(4), serde_json::to_string(&said).unwrap())
 }

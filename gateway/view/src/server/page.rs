@@ -9,8 +9,8 @@ use tungstenite::protocol::WebSocketConfig;
 use tungstenite::{Error, Message, WebSocket, accept_with_config};
 
 use super::ServerState;
-use crate::command::{self, Command};
 use crate::lock_ignoring_poison;
+use crate::page_command::{MAX_MESSAGE_BYTES, PageCommand, SelectionCommand};
 
 /// The time within which a page must receive each piece of a message.
 const MESSAGE_TIMEOUT: Duration = Duration::from_secs(5);
@@ -67,8 +67,8 @@ fn serve_websocket(begun: PrefixedStream, page: u64, shared: &ServerState) -> io
     stream.set_read_timeout(Some(MESSAGE_TIMEOUT))?;
     stream.set_write_timeout(Some(MESSAGE_TIMEOUT))?;
     let config = WebSocketConfig::default()
-        .max_message_size(Some(command::MAX_MESSAGE_BYTES))
-        .max_frame_size(Some(command::MAX_MESSAGE_BYTES))
+        .max_message_size(Some(MAX_MESSAGE_BYTES))
+        .max_frame_size(Some(MAX_MESSAGE_BYTES))
         .write_buffer_size(0)
         .max_write_buffer_size(64 << 20);
     let Ok(mut socket) = accept_with_config(begun, Some(config)) else {
@@ -136,12 +136,16 @@ fn exchange_messages(
 /// Handles a message that a page has sent.
 fn handle_message(text: &str, page: u64, shared: &ServerState) {
     let ignore = || _ = shared.ignored.fetch_add(1, Ordering::Relaxed);
-    match Command::parse(text) {
+    match PageCommand::parse(text) {
         None => ignore(),
-        Some(command) if command.affects_cells() && !shared.access.may_act => ignore(),
-        Some(command) if command.controls_playback() && !shared.access.may_play => ignore(),
-        Some(Command::Choose(chosen)) => _ = lock_ignoring_poison(&shared.chosen).insert(page, chosen),
-        Some(Command::Unchoose) => _ = lock_ignoring_poison(&shared.chosen).remove(&page),
+        Some(PageCommand::Select(SelectionCommand::Choose(chosen))) => {
+            _ = lock_ignoring_poison(&shared.chosen).insert(page, chosen);
+        }
+        Some(PageCommand::Select(SelectionCommand::Unchoose {})) => {
+            _ = lock_ignoring_poison(&shared.chosen).remove(&page);
+        }
+        Some(PageCommand::Control(_)) if !shared.access.may_act => ignore(),
+        Some(PageCommand::Playback(_)) if !shared.access.may_play => ignore(),
         Some(command) => {
             if shared.commands.try_send((page, command)).is_err() {
                 ignore();

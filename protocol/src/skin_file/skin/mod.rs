@@ -342,6 +342,20 @@ impl Skin {
         self.cells.iter().filter(move |cell| cell.bus == bus)
     }
 
+    /// Returns the cells that a name denotes, each with its index in [`Skin::cells`]: several if the name has no bus, and
+    /// several buses have a cell with this node id.
+    pub fn cells_named(&self, name: &CellName) -> impl Iterator<Item = (usize, &Cell)> {
+        self.cells.iter().enumerate().filter(|(_, cell)| {
+            self.buses.get(cell.bus).is_some_and(|bus| name.matches_cell(&bus.name, cell.node))
+        })
+    }
+
+    /// Returns the name of a cell with its bus.
+    #[must_use]
+    pub fn full_cell_name(&self, bus: usize, node: CellId) -> CellName {
+        CellName { bus: self.buses.get(bus).map(|bus| bus.name.clone()), node }
+    }
+
     /// Returns a copy with the cells of one bus only. All buses remain, so that their indices stay valid.
     #[must_use]
     pub fn with_cells_of_bus(&self, bus: usize) -> Self {

@@ -25,11 +25,11 @@ const LET_IN: i32 = 9;
 /// All commands that a page may send to a run.
 const COMMANDS: [&str; 7] = [
     r#"{"do":"halt"}"#,
-    r#"{"do":"press","bus":0,"node":1,"force_n":30}"#,
-    r#"{"do":"bench","on":"process","action":"kill","bus":0,"node":3}"#,
-    r#"{"do":"bench","on":"process","action":"stop","bus":0,"node":4}"#,
-    r#"{"do":"bench","on":"process","action":"restart","bus":0,"node":5}"#,
-    r#"{"do":"bench","on":"bus","down":true,"bus":0}"#,
+    r#"{"do":"press","cell":1,"force_n":30}"#,
+    r#"{"do":"kill","cell":3}"#,
+    r#"{"do":"stop","cell":4}"#,
+    r#"{"do":"restart","cell":5}"#,
+    r#"{"do":"bus","bus":"vcan0","down":true}"#,
     r#"{"do":"resume"}"#,
 ];
 
