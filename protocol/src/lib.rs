@@ -4,6 +4,8 @@
 #[cfg(feature = "host")]
 pub mod bus;
 #[cfg(feature = "host")]
+pub mod packets;
+#[cfg(feature = "host")]
 mod shell;
 #[cfg(feature = "host")]
 mod skin_file;

@@ -3,7 +3,6 @@
 //!
 //! | module | content |
 //! |---|---|
-//! | [`packets`] | frames into packets and messages |
 //! | [`decode`] | classes of frames, as text and JSON |
 //! | [`tracker`] | the state of a cell from its packets: identity, restarts, losses |
 //! | [`table`] | the state of a live bus: each cell, and sums |
@@ -24,7 +23,6 @@ pub mod generate;
 pub mod latched;
 pub mod listing;
 pub mod network;
-pub mod packets;
 pub mod quantiles;
 pub mod repeat;
 pub mod scenario;

@@ -19,16 +19,19 @@
 //! propagation delay of the cable (which the bit rate must allow for), or two nodes that send with one
 //! identifier. The latter is a fault on a real bus; here the earlier request is sent first.
 
+mod nodes;
 mod noise;
 mod priority;
 #[cfg(test)]
 mod tests;
+pub mod traffic;
 
 use std::cmp::Ordering;
 use std::collections::{BinaryHeap, VecDeque};
 
 use protocol::wire_time::{BitRates, FrameBits};
 
+pub use nodes::{NodeBus, QueueOrder, RequestRefused, Transmission, TransmitQueue, TransmitQueueError};
 pub use noise::{BitErrors, BitErrorsError, ERROR_FRAME_BITS};
 pub use priority::Priority;
 
@@ -179,10 +182,15 @@ impl<T: Copy> BusModel<T> {
         }
     }
 
-    /// Advances the time of the model to `until`, in ns. Frames that wait at `until` are not arbitrated yet, because
-    /// more requests may follow for that instant.
-    pub fn run_until(&mut self, until: u64) {
+    /// Advances the time of the model to `until`, in ns, unless it is later already, and returns it. Frames that wait
+    /// at that time are not arbitrated yet, because more requests may follow for that instant.
+    pub fn run_until(&mut self, until: u64) -> u64 {
         self.newest = self.newest.max(until);
+        self.transmit_until(self.newest);
+        self.newest
+    }
+
+    fn transmit_until(&mut self, until: u64) {
         loop {
             if let Some((waiting, attempt)) = self.on_wire {
                 if attempt.end > until {
@@ -228,6 +236,13 @@ impl<T: Copy> BusModel<T> {
             None if self.contenders.is_empty() => None,
             None => Some(self.free_at.max(self.ready_at) + 1),
         }
+    }
+
+    /// Returns the tags of all waiting frames, including the one on the wire, in no particular order.
+    pub fn waiting_tags(&self) -> impl Iterator<Item = T> + '_ {
+        let on_wire = self.on_wire.iter().map(|(waiting, _)| waiting);
+        let queued = self.queues.iter().flat_map(|queue| &queue.waiting_frames);
+        on_wire.chain(&self.contenders).chain(queued).map(|waiting| waiting.request.tag)
     }
 
     /// Returns the number of waiting frames, including the one on the wire.

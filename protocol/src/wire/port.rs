@@ -26,7 +26,7 @@
 //! | 11 | return | walk, first, last | the walk is done; the node ids that remain (none when first > last) |
 //! | 12 | probe | | requests a hello |
 
-use crate::can::{EXTENDED, EXTENDED_MASK, Frame, REMOTE};
+use crate::can::{EXTENDED, EXTENDED_MASK, Format, Frame, REMOTE};
 use crate::packet::{Epoch, crc16};
 
 /// Bit that is set in the identifiers of all simulated wires.
@@ -197,6 +197,14 @@ impl PortMessage {
             _ => return None,
         })
     }
+}
+
+/// Returns the message of a frame over a simulated wire. Returns `None` if the identifier or the CRC is not that of a
+/// wire: other buses use 29-bit identifiers, too.
+#[must_use]
+pub fn wire_message(frame: &Frame) -> Option<(LinkId, PortMessage)> {
+    let link_id = LinkId::from_raw_id(frame.raw_id()).filter(|_| frame.format() == Format::Classic)?;
+    Some((link_id, link_id.decode_frame(frame)?))
 }
 
 impl LinkId {

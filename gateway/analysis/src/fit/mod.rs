@@ -1,7 +1,6 @@
 //! Computes whether a skin fits on real buses: the load, the longest time from joints to the last answer, and the
 //! resulting numbers of cells and buses. Every command that reports a fit uses this module: limits, verdicts and their
-//! texts ([`verdict`]), bit rates ([`rates`]), and the separation of bench traffic from that of a real bus
-//! ([`traffic`]).
+//! texts ([`verdict`]), bit rates ([`rates`]). [`bus_model::traffic`] separates bench traffic from that of a real bus.
 //!
 //! The worst case assumes that all frames have the maximum of stuff bits ([`protocol::wire_time`]), that all cells are
 //! in contact, and that the bus is free of errors. Every node sends its lowest identifier first. Joints, answers,
@@ -19,7 +18,6 @@ mod json;
 pub mod limits;
 pub mod rates;
 pub mod response;
-pub mod traffic;
 pub mod verdict;
 
 use protocol::can::Format;

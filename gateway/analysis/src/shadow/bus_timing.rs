@@ -12,8 +12,8 @@ use super::report::{BusShadow, BusyStretches, DelayQuantiles, FrameCounts, Loads
 use super::reported::FrameTimings;
 use super::{MAX_WAITING_FRAMES, REORDER_WINDOW_NS, SATURATED_NS};
 use crate::fit;
-use crate::fit::traffic::{ClassifiedFrame, RunEvent, TrafficClassifier};
 use crate::fit::verdict::{AnsweringCells, FitSummary};
+use bus_model::traffic::{ClassifiedFrame, RunEvent, TrafficClassifier};
 use bus_model::{Attempt, BitErrors, BusModel, Priority, Request};
 
 /// Maximum number of frames that wait to be sent on a bus: some minutes of a bus at full load. Further frames are

@@ -5,7 +5,7 @@ use protocol::id::CellId;
 use protocol::packet::Epoch;
 
 use super::report::{AnsweringCounts, DelayQuantiles, ReplyStatistics};
-use crate::fit::traffic::RunEvent;
+use bus_model::traffic::RunEvent;
 
 /// A set of cells of a bus.
 #[derive(Clone, Copy, Debug, Default)]

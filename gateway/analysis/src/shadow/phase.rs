@@ -6,7 +6,7 @@ use protocol::id::{Id, Kind};
 use super::load::{BusyTime, LoadWindow};
 use super::report::{DelayQuantiles, KindDelays, Loads, Peak, StartUpFigures};
 use super::{SATURATED_NS, SECOND_NS};
-use crate::fit::traffic::RunEvent;
+use bus_model::traffic::RunEvent;
 
 /// Time without joints after which operation ends, in ns.
 pub const OPERATION_PAUSE_NS: u64 = SECOND_NS;

@@ -4,8 +4,8 @@ use model::quantiles::TimeHistogram;
 use protocol::wire_time::BitRates;
 use serde::{Serialize, Serializer};
 
-use crate::fit::traffic::BenchFrames;
 use crate::fit::verdict::{AnsweringCells, FitSummary};
+use bus_model::traffic::BenchFrames;
 
 /// The figures of all buses of a capture.
 #[derive(Clone, Debug, Serialize)]

@@ -32,7 +32,7 @@ use protocol::time::Micros;
 use std::collections::VecDeque;
 use thiserror::Error;
 
-use crate::packets::{ByIdentifier, FrameWithPacket, NoPacketReason, PacketReader};
+use protocol::packets::{ByIdentifier, FrameWithPacket, NoPacketReason, PacketReader};
 
 /// Maximum number of buses whose state is kept. Beyond it, the state of the oldest bus is dropped.
 pub const MAX_BUSES: usize = 64;
@@ -129,17 +129,9 @@ impl Decoded {
     }
 }
 
-/// Returns the message of a frame over a simulated wire. Returns `None` if the identifier or the CRC is not that of a
-/// wire: other buses use 29-bit identifiers, too.
-#[must_use]
-pub fn wire_message(frame: &Frame) -> Option<(port::LinkId, PortMessage)> {
-    let link_id = port::LinkId::from_raw_id(frame.raw_id()).filter(|_| frame.format() == Format::Classic)?;
-    Some((link_id, link_id.decode_frame(frame)?))
-}
-
 /// Classifies a frame that cannot be a packet.
 fn classify_non_data(frame: &Frame) -> Decoded {
-    let wired = wire_message(frame).map(|(link_id, message)| Decoded::Wire(link_id, message));
+    let wired = port::wire_message(frame).map(|(link_id, message)| Decoded::Wire(link_id, message));
     wired.unwrap_or_else(|| Decoded::Foreign(ForeignReason::from_frame(frame)))
 }
 

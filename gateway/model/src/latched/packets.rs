@@ -21,8 +21,8 @@ use protocol::packet::{self, Epoch, PacketError, Reassembler};
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
-use crate::packets::{ByIdentifier, NoPacketReason, PacketReader};
 use crate::tracker::{AddressClaim, ContactState, HeartbeatKind, PerCell};
+use protocol::packets::{ByIdentifier, NoPacketReason, PacketReader};
 
 /// A frame that was received from the bus.
 #[derive(Clone, Copy, Debug, PartialEq)]

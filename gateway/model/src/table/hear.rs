@@ -12,8 +12,8 @@ use super::held::TorqueSumChange;
 use super::replies::ReplyExpectation;
 use super::root_totals::{RootSum, RootSumUse, RootTotals};
 use super::{BusTable, FrameEvent, Notice, PositionLookup};
-use crate::packets::{FrameWithPacket, NoPacketReason, PendingSegments};
 use crate::tracker::{CellUpdate, HeartbeatKind};
+use protocol::packets::{FrameWithPacket, NoPacketReason, PendingSegments};
 
 /// Parameters whose write changes at once how a cell answers.
 const REPLY_PARAMETERS: [Parameter; 3] = [Parameter::Mode, Parameter::Reply, Parameter::Commit];

@@ -38,7 +38,7 @@ use protocol::time::Micros;
 
 use crate::central::CentralComputation;
 use crate::network::check::ObservedCell;
-use crate::packets::PacketReader;
+use protocol::packets::PacketReader;
 
 use epoch::Broadcast;
 use held::{TorqueSumChange, q3_12_to_nm};

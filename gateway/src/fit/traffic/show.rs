@@ -2,12 +2,12 @@
 
 use std::io::{self, Write};
 
-use analysis::fit::traffic::BenchFrames;
 use analysis::fit::verdict::format_percent;
 use analysis::shadow::{
     AnsweringCounts, BusShadow, BusyStretches, DelayQuantiles, FrameTiming, Identifier, Loads, Peak,
     ReplyStatistics, Shadow, ShadowReport, StartUpFigures,
 };
+use bus_model::traffic::BenchFrames;
 
 use trace::capture::seconds_since;
 

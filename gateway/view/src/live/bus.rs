@@ -3,7 +3,6 @@
 use analysis::fit::rates::RequestedRates;
 use bench::view::CellView;
 use model::central::CentralComputation;
-use model::decode::wire_message;
 use model::table::{BusTable, CellState, CellStatus, Notice};
 use protocol::can::Frame;
 use protocol::fixed::{Q1_14, TorqueFormat};
@@ -11,6 +10,7 @@ use protocol::id::CellId;
 use protocol::message::{Message, SkinSensors};
 use protocol::packet::{Epoch, Words};
 use protocol::parameters::MAX_JOINTS;
+use protocol::port::wire_message;
 use protocol::skin::{Skin, SkinReply};
 use protocol::time::Micros;
 use protocol::wire_time::{BitRates, FrameBits};

@@ -181,7 +181,7 @@ fn simulate(case: &BusCase, epochs: u64, seed: u64, how: (Computation, Heartbeat
                 let ((at, _), (sent, due)) = bench.agenda.pop_first().unwrap();
                 bench.send(at, sent, due);
             }
-            (_, Some(at)) => bench.bus.run_until(at),
+            (_, Some(at)) => _ = bench.bus.run_until(at),
             (Some(_), None) => unreachable!("the guard above takes it"),
         }
         while let Some(attempt) = bench.bus.poll() {

@@ -1,8 +1,8 @@
 //! Tests of a whole run: start-up and operation, bench-only frames, answering cells, and the fit.
 
 use super::super::*;
-use crate::fit::traffic::BenchFrames;
 use crate::fit::verdict::FitVerdict;
+use bus_model::traffic::BenchFrames;
 use model::generate::{SkinRequest, generate};
 use protocol::can::{BIT_RATE_SWITCH, FD_FORMAT, Format};
 use protocol::fixed::Q3_12;

@@ -9,14 +9,14 @@
 //! Cells have their own receiver, which fits a microcontroller, and `conformance` has another one to test them
 //! independently.
 
-use protocol::can::{Format, Frame};
-use protocol::id::{Command, Id};
-use protocol::message::{Message, MessageError};
-use protocol::packet::{
+use crate::can::{Format, Frame};
+use crate::id::{Command, Id};
+use crate::message::{Message, MessageError};
+use crate::packet::{
     Length, Lengths, Packet, PacketError, PacketRef, Reassembler, Reassembly, data_frame_id,
 };
-use protocol::skin::Skin;
-use protocol::time::Micros;
+use crate::skin::Skin;
+use crate::time::Micros;
 
 /// The number of identifiers of 11 bits.
 const IDENTIFIER_COUNT: usize = 1 << 11;
@@ -74,7 +74,7 @@ impl FrameWithPacket<'_> {
 
 /// A value for each identifier of 11 bits, allocated on first use: a bus uses few of them.
 #[derive(Clone, Debug)]
-pub(crate) struct ByIdentifier<T>(pub(crate) Vec<Option<Box<T>>>);
+pub struct ByIdentifier<T>(pub Vec<Option<Box<T>>>);
 
 impl<T> Default for ByIdentifier<T> {
     fn default() -> Self {
@@ -84,7 +84,8 @@ impl<T> Default for ByIdentifier<T> {
 
 impl<T: Clone + Default> ByIdentifier<T> {
     /// Returns the value of an identifier, by default a new one.
-    pub(crate) fn entry(&mut self, id: Id) -> &mut T {
+    #[expect(clippy::missing_panics_doc, reason = "the list has that length")]
+    pub fn entry(&mut self, id: Id) -> &mut T {
         if self.0.is_empty() {
             self.0.resize(IDENTIFIER_COUNT, None);
         }
@@ -92,7 +93,7 @@ impl<T: Clone + Default> ByIdentifier<T> {
     }
 
     /// Returns the value of an identifier that was used.
-    pub(crate) fn get_mut(&mut self, id: Id) -> Option<&mut T> {
+    pub fn get_mut(&mut self, id: Id) -> Option<&mut T> {
         self.0.get_mut(usize::from(id.to_bits()))?.as_deref_mut()
     }
 }
@@ -139,9 +140,12 @@ impl PacketReader {
 
     /// Does the first half of [`read`](Self::read): returns the packet that the frame is or completes, for
     /// [`decode`](Self::decode).
+    ///
+    /// # Errors
+    /// Returns the reason if the frame neither is nor completes a packet.
     // Inlined, as `reassemble`: the receiver of a bus calls them for every frame, and copies each packet once less.
     #[inline(always)]
-    pub(crate) fn read_packet(
+    pub fn read_packet(
         &mut self,
         at: Micros,
         frame: &Frame,
@@ -163,8 +167,11 @@ impl PacketReader {
     }
 
     /// Does the second half of [`read`](Self::read): decodes a packet.
+    ///
+    /// # Errors
+    /// Returns [`MessageError`] if this version cannot decode the packet.
     #[inline]
-    pub(crate) fn decode(&mut self, packet: &Packet) -> Result<Message, MessageError> {
+    pub fn decode(&mut self, packet: &Packet) -> Result<Message, MessageError> {
         let message = Message::decode(packet);
         if let (Ok(Message::Joints { joints, .. }), ChainLength::FromJoints(length)) =
             (&message, &mut self.length)

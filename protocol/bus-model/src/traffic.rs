@@ -7,11 +7,10 @@ use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Node};
 use protocol::message::{Message, NetworkPage, State};
 use protocol::packet::Epoch;
+use protocol::packets::{NoPacketReason, PacketReader};
+use protocol::port::wire_message;
 use protocol::time::Micros;
 use serde::Serialize;
-
-use model::decode::wire_message;
-use model::packets::{NoPacketReason, PacketReader};
 
 /// The kinds of frames that only a bench sends, and a real robot does not.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
