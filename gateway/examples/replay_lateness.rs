@@ -7,6 +7,7 @@
 use std::fmt::Write as _;
 use std::time::Duration;
 
+use bench::bus::time::BusTimeChoice;
 use bench::replay::player::ReplaySpeed;
 use bench::replay::replay_plan::SenderFilter;
 use bench::replay::survey::TimeRange;
@@ -43,6 +44,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let options = ReplayOptions {
             files: vec![file.clone()],
             kinds: KindChoices::same_for_all(kind),
+            bus_time: BusTimeChoice::None,
             only: SenderFilter::All,
             buses: Vec::new(),
             map: Vec::new(),

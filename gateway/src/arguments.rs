@@ -2,6 +2,7 @@
 
 use std::ops::RangeInclusive;
 
+use bench::bus::time::BusTimeChoice;
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use protocol::bus::{BusKind, KindChoice, KindChoices, KindOption};
@@ -59,6 +60,21 @@ pub(crate) fn parse_time_ns(text: &str) -> Result<u64, String> {
 pub(crate) struct BusKinds {
     #[arg(long, value_name = "[BUS=]KIND", help = kinds_help())]
     bus_kind: Vec<KindOption>,
+}
+
+/// The option for the time that frames take on embedded buses.
+#[derive(Args, Clone, Copy, Debug)]
+pub(crate) struct BusTimeOption {
+    /// Let frames take time on embedded buses, as on a real bus with the skin's bit rates (else 1M/5M): none, real, or
+    /// real with the transmit queue of each program, such as real:fifo:10 [default: as the skin says, else none]
+    #[arg(long, value_name = "TIME")]
+    bus_time: Option<BusTimeChoice>,
+}
+
+impl BusTimeOption {
+    pub(crate) fn choice(self) -> BusTimeChoice {
+        self.bus_time.unwrap_or_default()
+    }
 }
 
 fn kinds_help() -> String {

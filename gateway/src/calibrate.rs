@@ -6,6 +6,7 @@ mod recorded;
 use std::path::PathBuf;
 use std::thread;
 
+use bench::bus::time::BusTimeChoice;
 use bench::record::{self, McapOutput};
 use bench::run::{self, RunOptions};
 use bench::summary::Outcome;
@@ -266,6 +267,8 @@ impl CalibrateCommand {
             scenario,
             kinds: self.kinds.kinds_of_buses(bus_names(skin))?,
             directory: None,
+            // Cells are to be calibrated, not the bus.
+            bus_time: BusTimeChoice::None,
             spawn: !self.no_spawn,
             emulated: None,
             // One process per bus: cells that share a machine do not affect the result.

@@ -13,7 +13,7 @@ use clap::Args;
 use protocol::usage::{Failure, printable, printable_lines};
 
 use super::arguments::{
-    BusKinds, OptionValue, cells_per_process, environment_number, one_of_values, parse_time_ns,
+    BusKinds, BusTimeOption, OptionValue, cells_per_process, environment_number, one_of_values, parse_time_ns,
 };
 use super::output::{self, OverwriteOption, check_distinct_files, print_table};
 use super::print::{
@@ -52,6 +52,8 @@ pub(crate) struct ReplayCommand {
     files: Vec<PathBuf>,
     #[command(flatten)]
     kinds: BusKinds,
+    #[command(flatten)]
+    time: BusTimeOption,
     #[command(flatten)]
     frames: FrameOptions,
     /// Repeat N times; 0 repeats until Ctrl-C
@@ -184,6 +186,7 @@ impl ReplayCommand {
         Ok(ReplayOptions {
             files: self.files.clone(),
             kinds: self.kinds.kinds_of_any_buses()?,
+            bus_time: self.time.choice(),
             only,
             buses: self.frames.bus.clone(),
             map: self.frames.map.clone(),

@@ -8,6 +8,9 @@ use std::panic::{self, AssertUnwindSafe};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use analysis::fit::assess_worst_case;
+use analysis::fit::verdict::FitSummary;
+use bench::bus::time::BusTimeChoice;
 use bench::emulate::EmulatedCells;
 use bench::processes::create_memory_file;
 use bench::record::{self, CandumpOutput};
@@ -25,8 +28,8 @@ use protocol::usage::{Failure, command_line, eprint_lines, shell_quoted_os};
 use trace::recording::series::{AttachedFile, SplitLimits};
 
 use super::arguments::{
-    BusKinds, ProcessOptions, bus_names, cells_per_process, environment_number, find_cell, parse_duration,
-    parse_time,
+    BusKinds, BusTimeOption, ProcessOptions, bus_names, cells_per_process, environment_number, find_cell,
+    parse_duration, parse_time,
 };
 use super::buses;
 use super::output::{self, OverwriteOption, check_distinct_files, print_note, print_table};
@@ -166,6 +169,8 @@ pub(crate) struct DemoCommand {
     candump: Option<PathBuf>,
     #[command(flatten)]
     kinds: BusKinds,
+    #[command(flatten)]
+    time: BusTimeOption,
 }
 
 /// Run a bench: cells, buses, the control loop
@@ -201,6 +206,8 @@ pub(crate) struct RunCommand {
     candump: Option<PathBuf>,
     #[command(flatten)]
     kinds: BusKinds,
+    #[command(flatten)]
+    time: BusTimeOption,
     /// Read commands from standard input and write events to standard output, for a program that presses cells;
     /// docs/reference/control.md describes them. The run ends at the end of the input, or after --duration [default: a
     /// day]
@@ -235,6 +242,7 @@ impl DemoCommand {
             .map_err(Failure::usage_error)?;
         let mut options = self.common.options(skin_file, skin, scenario, false);
         options.cells_per_process = cells_per_process()?;
+        options.bus_time = self.time.choice();
         options.kinds = self
             .kinds
             .kinds_or_default(KindChoice::Only(BusKind::Embedded))?
@@ -265,6 +273,7 @@ impl DemoCommand {
             robot,
         };
         options.record = recording.options(candump, files, &[]);
+        announce_bus_time(&mut options);
         let page = view.then(|| PageProcess::start(&options, listen, &PageOptions::default())).transpose()?;
         let remotes = RunRemotes { page, is_controlled: false };
         run_bench(&options, (summary.as_deref(), recording.overwrite), verbose, &[], remotes)
@@ -309,15 +318,28 @@ impl RunCommand {
         let files = RunTexts { skin: skin_text, scenario: scenario_text, robot };
         options.record = recording.options(candump, files, &self.record_split);
         options.spawn = !self.no_spawn;
+        options.bus_time = self.time.choice();
         options.flash = self.flash;
         options.emulated = emulated(self.firmware, &self.emulate, &options.skin)?;
         // The kernel grants twice the size, or less without the privilege.
         let bytes = environment_number("SKINBUS_RECEIVE_BUFFER", 0..=1 << 30)?;
         options.receive_buffer = bytes.unwrap_or(GATEWAY_RECEIVE_BUFFER_BYTES) as usize;
         options.cells_per_process = self.processes.cells_per_process.into();
+        announce_bus_time(&mut options);
         let page = view.then(|| PageProcess::start(&options, listen, &self.page)).transpose()?;
         let remotes = RunRemotes { page, is_controlled: self.control };
         run_bench(&options, (summary.as_deref(), recording.overwrite), verbose, &read, remotes)
+    }
+}
+
+/// Announces the bit rates of timed buses, and the worst case that is to be compared with the measured load.
+fn announce_bus_time(options: &mut RunOptions) {
+    let RunOptions { skin, bus_time, announced, .. } = options;
+    for (index, bus) in skin.buses.iter().enumerate() {
+        let Some(time) = bus_time.served_time(bus) else { continue };
+        let worst = assess_worst_case(skin, index, time.rates);
+        let worst = worst.map_or_else(String::new, |rated| format!("; {}", FitSummary::worst_case(&rated)));
+        announced.push(format!("{}: frames take time: {time}{worst}", bus.name));
     }
 }
 
@@ -360,6 +382,7 @@ impl CommonOptions {
             scenario,
             kinds: KindChoices::default(),
             directory: None,
+            bus_time: BusTimeChoice::Described,
             spawn: true,
             emulated: None,
             cells_per_process: 1,

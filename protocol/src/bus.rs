@@ -34,7 +34,7 @@ use socketcan::CanFdSocket;
 
 use crate::can::{Format, Frame};
 use batch::{MAX_BATCH_DATAGRAMS, ReceiveBatch, SMALL_BATCH_SIZE};
-use carrier::BusBackend;
+use carrier::{BusBackend, OpenedSocket};
 
 pub mod batch;
 #[expect(unsafe_code, reason = "recvmmsg and sendmmsg have no safe wrapper")]
@@ -108,6 +108,7 @@ pub struct Bus {
     kind: BusKind,
     socket: CanFdSocket,
     receive_buffer: usize,
+    is_timed: bool,
     fd: bool,
     send_timeout: Duration,
     /// The directory of embedded buses, as in [`BusOptions`].
@@ -136,18 +137,20 @@ impl Bus {
         check_name(name)?;
         check_filter_count(name, &options.filters)?;
         let kind = choice.resolve(name);
-        let (socket, receive_buffer) = match (kind.backend().open(name, options), choice) {
-            (Err(BusError::NotServed { name, directory }), KindChoice::Auto) => {
-                return Err(BusError::Absent { name, directory });
-            }
-            (opened, _) => opened?,
-        };
+        let OpenedSocket { socket, receive_buffer, is_timed } =
+            match (kind.backend().open(name, options), choice) {
+                (Err(BusError::NotServed { name, directory }), KindChoice::Auto) => {
+                    return Err(BusError::Absent { name, directory });
+                }
+                (opened, _) => opened?,
+            };
         let BusOptions { fd, send_timeout, .. } = *options;
         Ok(Self {
             name: name.to_owned(),
             kind,
             socket,
             receive_buffer,
+            is_timed,
             fd,
             send_timeout,
             directory: options.directory.clone(),
@@ -174,6 +177,20 @@ impl Bus {
     #[must_use]
     pub const fn carries_fd(&self) -> bool {
         self.fd
+    }
+
+    /// Returns true if frames take time on the bus as on a real one, so that their time stamps are their ends.
+    #[must_use]
+    pub const fn is_timed(&self) -> bool {
+        self.is_timed
+    }
+
+    /// Returns the bus, unless frames take time on it.
+    ///
+    /// # Errors
+    /// Returns [`BusError::TakesTime`] if they do.
+    pub fn without_time(self) -> Result<Self, BusError> {
+        if self.is_timed { Err(BusError::TakesTime(self.name)) } else { Ok(self) }
     }
 
     /// Returns true if the bus has no hardware: an embedded bus, a vcan or a vxcan.

@@ -5,7 +5,9 @@
 //!                          16 or 72 bytes       filters       bounded, counts drops
 //! ```
 //!
-//! Routing and queues are pure. [`Server`] does the input and output, with one thread and one `epoll`. Frames are
+//! With a [`TimedBusOptions`], a model of a real bus stands between acceptance and routing: `timed.rs`.
+//!
+//! Routing, queues and the timed bus are pure. [`Server`] does the input and output, with one thread and one `epoll`. Frames are
 //! forwarded in the order in which the server reads them, so all clients receive them in the same order. Only the user
 //! who serves the bus can connect. The bus is not an `AF_CAN` interface, so `candump` cannot attach to it.
 
@@ -16,11 +18,13 @@ pub mod queue;
 pub mod routing;
 mod served;
 pub mod server;
+mod timed;
 mod totals;
 
 pub use place::BusSocketError;
 pub use served::ServerThread;
 pub use server::{ServeError, Server};
+pub use timed::{BusRecord, DelayQuantiles, TimedBusOptions, TimedReport};
 pub use totals::BusTotals;
 
 #[cfg(test)]

@@ -12,6 +12,7 @@ use protocol::time::Span;
 use thiserror::Error;
 
 use crate::bus::served::ServeError;
+use crate::bus::time::BusTimeError;
 use crate::emulate::EmulateError;
 use crate::processes::{LaunchError, MemoryFileError};
 use crate::record::OutputError;
@@ -36,6 +37,9 @@ pub enum RunError {
     /// A program does not start.
     #[error(transparent)]
     Launch(#[from] LaunchError),
+    /// Frames do not take time on a bus, though they must.
+    #[error(transparent)]
+    Time(#[from] BusTimeError),
     /// The recording cannot be created.
     #[error(transparent)]
     Output(#[from] OutputError),
@@ -182,6 +186,7 @@ impl RunError {
             | Self::TooDeep(_)
             | Self::NoFlash(_)
             | Self::BusFault { .. }
+            | Self::Time(_)
             | Self::RealWires(_) => 2,
             Self::Signal(_)
             | Self::Interrupted
@@ -207,6 +212,7 @@ impl From<ServeError> for RunError {
         match error {
             ServeError::Bus(error) => Self::Bus(error),
             ServeError::Launch(error) => Self::Launch(error),
+            ServeError::Time(error) => Self::Time(error),
         }
     }
 }

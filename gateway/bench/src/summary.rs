@@ -11,14 +11,18 @@ use serde::Serialize;
 
 pub use self::cells::{CellSummary, RepliesSummary};
 pub use self::outcome::{CellError, ErrorCells, HaltSummary, Outcome, TickSummary, cells_in_error};
+pub use self::uplink::UplinkSummary;
 pub(crate) use self::verdict::count_noun;
 pub use self::verdict::{MAX_CELL_ERROR_NM, Verdict};
 use model::quantiles::Quantiles;
 use model::table::{BusTable, CellStatus, Contributions, FrameEvent, SumCounts, TorqueAccuracy};
 pub use trace::recording::account::{RecordingAccount, WrittenFile};
+pub use vcan_setup::embedded::TimedReport;
 
 mod cells;
 mod outcome;
+mod timed;
+mod uplink;
 mod verdict;
 
 /// Summary of a run.
@@ -211,59 +215,6 @@ pub struct PrivateMemory {
     pub buses_private_kib: Option<u64>,
 }
 
-/// Packets from the cells. They add up: sent = delivered + rejected + unheard + lost - surplus, and lost = dropped +
-/// backlog + outage + hosts + unknown.
-#[derive(Clone, Copy, Debug, Default, Serialize)]
-pub struct UplinkSummary {
-    /// Packets sent, according to the counts in the cells' last heartbeats.
-    pub sent: u64,
-    /// Packets that arrived and were decoded.
-    pub delivered: u64,
-    /// Packets that arrived and were rejected.
-    pub rejected: u64,
-    /// Sums for another cell, which the filter of the gateway's socket excluded.
-    pub unheard: u64,
-    /// Packets lost because the bus dropped frames that this program did not read in time.
-    pub dropped: u64,
-    /// Packets lost for which drops in the kernel's backlog are the likely reason.
-    pub backlog: u64,
-    /// Packets lost during losses of the bus.
-    pub outage: u64,
-    /// Packets lost between hosts.
-    pub hosts: u64,
-    /// Packets lost for an unknown reason.
-    pub unknown: u64,
-    /// Packets that arrived beyond the number sent.
-    pub surplus: u64,
-    /// Heartbeats of other senders under a cell's node id, included in the surplus.
-    pub outsiders: u64,
-    /// Packets that arrived and were sent after a cell's last heartbeat before its restart. The number of packets sent
-    /// in this time is unknown.
-    pub in_doubt: u64,
-    /// Packets that arrived after a cell's last heartbeat, so that no count of the cell includes them.
-    pub unsettled: u64,
-    /// Number of restarts of cells.
-    pub restarts: u32,
-}
-
-impl UplinkSummary {
-    /// Attributes up to `at_most` of the unknown losses to links between hosts.
-    pub fn attribute_losses_to_hosts(&mut self, at_most: u64) {
-        let explained = self.unknown.min(at_most);
-        self.unknown -= explained;
-        self.hosts += explained;
-    }
-
-    /// Attributes up to `at_most` of the unknown losses to the kernel's backlog. Returns the number of packets
-    /// attributed.
-    pub fn attribute_losses_to_backlog(&mut self, at_most: u64) -> u64 {
-        let explained = self.unknown.min(at_most);
-        self.unknown -= explained;
-        self.backlog += explained;
-        explained
-    }
-}
-
 /// Sums that were received along the cells' tree.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct SumsSummary {
@@ -361,6 +312,8 @@ pub struct BusSummary {
     pub cells: BTreeMap<&'static str, usize>,
     /// Cells that were dead at the end, or from which no packet was received.
     pub silent_cells: Vec<u8>,
+    /// Figures of a timed bus that this run served.
+    pub timed: Option<TimedReport>,
     /// Packets from the cells.
     pub uplink: UplinkSummary,
     /// Replies of cells that answer with their own torques.
@@ -427,7 +380,8 @@ impl BusSummary {
             hosts: Vec::new(),
             cells,
             silent_cells,
-            uplink: uplink(table, dropped),
+            timed: None,
+            uplink: UplinkSummary::new(table, dropped),
             replies: replies(table),
             sums: sums(table),
             network: None,
@@ -456,28 +410,6 @@ fn sensors(table: &BusTable) -> SensorsSummary {
         min_hz: rates.iter().copied().reduce(f64::min),
         mean_hz: cells.map(|cells| rates.iter().sum::<f64>() / f64::from(cells)),
         max_hz: rates.iter().copied().reduce(f64::max),
-    }
-}
-
-fn uplink(table: &BusTable, dropped_by_bus: u64) -> UplinkSummary {
-    let total = table.uplink();
-    let unexplained = total.lost - total.outage;
-    let dropped = unexplained.min(dropped_by_bus);
-    UplinkSummary {
-        sent: total.sent,
-        delivered: total.delivered,
-        rejected: total.rejected,
-        unheard: total.unheard,
-        dropped,
-        backlog: 0,
-        outage: total.outage,
-        hosts: 0,
-        unknown: unexplained - dropped,
-        surplus: total.surplus,
-        outsiders: total.outsiders,
-        in_doubt: total.in_doubt,
-        unsettled: total.unsettled,
-        restarts: total.restarts,
     }
 }
 

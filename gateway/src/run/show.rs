@@ -92,6 +92,7 @@ fn summary_rows(summary: &Summary, look: TableStyle) -> KeyValueTable {
     add_control_rows(&mut rows, summary, is_verbose);
     for bus in &summary.buses {
         add_reply_rows(&mut rows, bus, is_verbose);
+        frames::add_timed_rows(&mut rows, bus, is_verbose);
         frames::add_frame_rows(&mut rows, bus, is_verbose);
         add_noteworthy_cell_rows(&mut rows, bus, &summary.cells);
     }

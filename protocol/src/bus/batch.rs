@@ -10,6 +10,7 @@ use rustix::io::Errno;
 use rustix::net::SendFlags;
 
 use super::calls;
+use super::embedded::{MAX_FRAME_DATAGRAM_BYTES, STAMP_BYTES};
 use super::slot::DatagramBuffer;
 use crate::can::FD_BYTES;
 
@@ -24,7 +25,7 @@ const FIRST_BATCH_SIZE: usize = 4;
 /// [`FIRST_BATCH_SIZE`].
 pub(super) const SMALL_BATCH_SIZE: usize = 8;
 
-/// A receive buffer for up to [`MAX_BATCH_DATAGRAMS`] datagrams of at most 72 bytes.
+/// A receive buffer for up to [`MAX_BATCH_DATAGRAMS`] datagrams of at most 80 bytes.
 pub struct ReceiveBatch {
     slots: Box<[DatagramBuffer; MAX_BATCH_DATAGRAMS]>,
     count: usize,
@@ -36,8 +37,13 @@ impl ReceiveBatch {
     /// Creates an empty buffer.
     #[must_use]
     pub fn new() -> Self {
-        let slot =
-            || DatagramBuffer { bytes: [0; FD_BYTES], control: [0; 8], len: 0, control_len: 0, flags: 0 };
+        let slot = || DatagramBuffer {
+            bytes: [0; MAX_FRAME_DATAGRAM_BYTES],
+            control: [0; 8],
+            len: 0,
+            control_len: 0,
+            flags: 0,
+        };
         Self { slots: Box::new(std::array::from_fn(|_| slot())), count: 0, failure: None }
     }
 
@@ -104,7 +110,7 @@ impl std::fmt::Debug for ReceiveBatch {
 pub struct Datagram<'a>(&'a DatagramBuffer);
 
 impl<'a> Datagram<'a> {
-    /// Returns the bytes of the datagram; `None` if it was truncated because it is longer than 72 bytes.
+    /// Returns the bytes of the datagram; `None` if it was truncated because it is longer than 80 bytes.
     #[must_use]
     pub fn bytes(self) -> Option<&'a [u8]> {
         if self.0.flags & libc::MSG_TRUNC == 0 { self.0.bytes.get(..self.0.len) } else { None }
@@ -131,9 +137,9 @@ impl std::fmt::Debug for Datagram<'_> {
     }
 }
 
-/// A send buffer for up to N datagrams of at most 72 bytes.
+/// A send buffer for up to N datagrams of at most 72 bytes, each with a time stamp if it has one.
 pub struct Outgoing<const N: usize = MAX_BATCH_DATAGRAMS> {
-    bytes: [[u8; FD_BYTES]; N],
+    bytes: [[u8; MAX_FRAME_DATAGRAM_BYTES]; N],
     lens: [usize; N],
     count: usize,
 }
@@ -142,7 +148,7 @@ impl<const N: usize> Outgoing<N> {
     /// Creates an empty buffer.
     #[must_use]
     pub const fn new() -> Self {
-        Self { bytes: [[0; FD_BYTES]; N], lens: [0; N], count: 0 }
+        Self { bytes: [[0; MAX_FRAME_DATAGRAM_BYTES]; N], lens: [0; N], count: 0 }
     }
 
     /// Removes all datagrams from the buffer.
@@ -154,10 +160,22 @@ impl<const N: usize> Outgoing<N> {
     pub fn push(&mut self, bytes: &[u8; FD_BYTES], len: usize) -> bool {
         let room = self.bytes.get_mut(self.count).zip(self.lens.get_mut(self.count));
         let Some((to, to_len)) = room else { return false };
-        *to = *bytes;
+        if let Some((to, _)) = to.split_first_chunk_mut() {
+            *to = *bytes;
+        }
         *to_len = len.min(FD_BYTES);
         self.count += 1;
         true
+    }
+
+    /// Appends the time stamp of a timed bus to the last datagram.
+    pub fn append_stamp(&mut self, nanos: u64) {
+        let last = self.count.wrapping_sub(1);
+        let Some((bytes, len)) = self.bytes.get_mut(last).zip(self.lens.get_mut(last)) else { return };
+        if let Some((to, _)) = bytes.get_mut(*len..).and_then(<[u8]>::split_first_chunk_mut) {
+            *to = nanos.to_le_bytes();
+            *len += STAMP_BYTES;
+        }
     }
 
     /// Sends all datagrams in order without waiting, and returns the number that the socket accepted.

@@ -8,11 +8,19 @@ use socketcan::CanFdSocket;
 use super::batch::Datagram;
 use super::{Bus, BusError, BusOptions, Filter};
 
+/// A socket of an open bus.
+pub(super) struct OpenedSocket {
+    pub(super) socket: CanFdSocket,
+    /// Size of the receive buffer, as the kernel counts it.
+    pub(super) receive_buffer: usize,
+    /// True if time stamps are those of a timed bus: ends of frames.
+    pub(super) is_timed: bool,
+}
+
 /// The operations in which the kinds of buses differ; the rest of [`Bus`] is common to all.
 pub(super) trait BusBackend {
-    /// Opens a bus, with filters and time stamps enabled. Returns the socket, and the size of its receive
-    /// buffer as the kernel counts it.
-    fn open(&self, name: &str, options: &BusOptions) -> Result<(CanFdSocket, usize), BusError>;
+    /// Opens a bus, with filters and time stamps enabled.
+    fn open(&self, name: &str, options: &BusOptions) -> Result<OpenedSocket, BusError>;
 
     /// Returns the name under which a process serves the bus.
     fn served_name(&self, name: &str) -> String {
@@ -27,6 +35,16 @@ pub(super) trait BusBackend {
 
     /// Returns true if the socket that received this frame also sent it.
     fn is_own(&self, frame: Datagram<'_>) -> bool;
+
+    /// Splits the bytes of a datagram into a frame and the time stamp that the bus gave it, if any.
+    fn split_stamp<'b>(&self, datagram: &'b [u8]) -> (&'b [u8], Option<u64>) {
+        (datagram, None)
+    }
+
+    /// Decodes a refusal notice and returns the number of frames refused so far; `None` for other datagrams.
+    fn decode_refusal_notice(&self, _notice: &[u8]) -> Option<u32> {
+        None
+    }
 
     /// Decodes a drop notice and returns the number of frames dropped so far; `None` for other datagrams.
     fn decode_drop_notice(&self, notice: &[u8]) -> Option<u32>;

@@ -4,9 +4,13 @@
 //! docs/reference/embedded-bus.md describes each byte. A frame is a datagram of 16 or 72 bytes, identical to the
 //! kernel's struct; no control datagram has either length.
 
-use std::os::fd::AsFd;
+use std::io;
+use std::os::fd::{AsFd, OwnedFd};
+
+use socketcan::{CanFdSocket, SocketOptions};
 
 use super::{Filter, calls};
+use crate::can::{CLASSIC_BYTES, FD_BYTES};
 
 pub use client::seqpacket_socket;
 pub(super) use client::{EmbeddedBackend, closed_error};
@@ -18,8 +22,14 @@ pub use directory::{
 mod client;
 mod directory;
 
-/// The version of the protocol between client and server, which every hello contains.
-pub const HELLO_VERSION: u8 = 2;
+/// The newest version of the protocol between client and server, which every hello contains.
+pub const HELLO_VERSION: u8 = 3;
+/// The oldest version that a server understands. It has no time stamps of the bus.
+pub const OLDEST_HELLO_VERSION: u8 = 2;
+/// Length in bytes of the time stamp that follows a frame on a timed bus.
+pub const STAMP_BYTES: usize = 8;
+/// Maximum length of a datagram with a frame in bytes.
+pub const MAX_FRAME_DATAGRAM_BYTES: usize = FD_BYTES + STAMP_BYTES;
 /// Index of the byte in a frame that is 1 if the receiving client sent the frame itself.
 pub const OWN_FRAME_BYTE_INDEX: usize = 6;
 /// Maximum length of a client's hello in bytes.
@@ -27,12 +37,21 @@ pub const MAX_HELLO_BYTES: usize = HELLO_HEADER_BYTES + 8 * Filter::MAX_COUNT;
 
 const HELLO_MAGIC: &[u8; 7] = b"skinbus";
 const HELLO_HEADER_BYTES: usize = 23;
+/// Length of an answer of version 2 in bytes.
 const HELLO_REPLY_BYTES: usize = 17;
 
 /// Returns the id of the process that connected a socket; `None` if the process is in another pid namespace.
 #[must_use]
 pub fn peer_process(socket: impl AsFd) -> Option<u32> {
     calls::peer_process(socket.as_fd())
+}
+
+/// Enables the kernel's time stamps (`SO_TIMESTAMPNS`) of the datagrams that a socket receives from now on.
+///
+/// # Errors
+/// Returns the error of `setsockopt`.
+pub fn enable_time_stamps(socket: &OwnedFd) -> io::Result<()> {
+    CanFdSocket::from(socket.try_clone()?).set_recv_timestamp(true)
 }
 
 /// The first datagram of a client: its filters and options.
@@ -48,6 +67,25 @@ pub struct ClientHello {
     pub error_mask: u32,
     /// Requested size of the receive buffer in bytes.
     pub buffer: u64,
+    /// Version of the protocol: [`OLDEST_HELLO_VERSION`] to [`HELLO_VERSION`].
+    pub version: u8,
+    /// True to receive the time stamps of a timed bus. Version 2 has none.
+    pub stamps: bool,
+}
+
+impl Default for ClientHello {
+    /// Returns a hello of the newest version for CAN FD frames, without filters, own frames and stamps.
+    fn default() -> Self {
+        Self {
+            filters: Vec::new(),
+            own_frames: false,
+            fd: true,
+            error_mask: 0,
+            buffer: 0,
+            version: HELLO_VERSION,
+            stamps: false,
+        }
+    }
 }
 
 impl ClientHello {
@@ -56,30 +94,54 @@ impl ClientHello {
     pub fn encode(&self) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(HELLO_HEADER_BYTES + 8 * self.filters.len());
         bytes.extend_from_slice(HELLO_MAGIC);
-        bytes.extend_from_slice(&[HELLO_VERSION, self.own_frames.into(), self.fd.into()]);
+        bytes.extend_from_slice(&[self.version, self.own_frames.into(), self.fd.into()]);
         bytes.extend_from_slice(&self.error_mask.to_le_bytes());
         bytes.extend_from_slice(&self.buffer.to_le_bytes());
-        bytes.push(0);
+        bytes.push(self.stamps.into());
         encode_filters(&self.filters, &mut bytes);
         bytes
     }
 
-    /// Decodes a datagram. Returns `None` if it is not a hello of this version. Never panics.
+    /// Decodes a datagram. Returns `None` if it is not a hello of a known version. Never panics.
     #[must_use]
     pub fn decode(bytes: &[u8]) -> Option<Self> {
         let (head, filters) = bytes.split_first_chunk::<HELLO_HEADER_BYTES>()?;
         let rest = head.strip_prefix(HELLO_MAGIC)?;
-        let &[HELLO_VERSION, own @ 0..=1, fd @ 0..=1, m0, m1, m2, m3, ref rest @ ..] = rest else {
+        let &[
+            version @ OLDEST_HELLO_VERSION..=HELLO_VERSION,
+            own @ 0..=1,
+            fd @ 0..=1,
+            m0,
+            m1,
+            m2,
+            m3,
+            ref rest @ ..,
+        ] = rest
+        else {
             return None;
         };
-        let (buffer, [0]) = rest.split_first_chunk()? else { return None };
+        let (buffer, &[stamps]) = rest.split_first_chunk()? else { return None };
+        if stamps > u8::from(version > OLDEST_HELLO_VERSION) {
+            return None;
+        }
         Some(Self {
             filters: decode_filters(filters).filter(|filters| filters.len() <= Filter::MAX_COUNT)?,
             own_frames: own == 1,
             fd: fd == 1,
             error_mask: u32::from_le_bytes([m0, m1, m2, m3]),
             buffer: u64::from_le_bytes(*buffer),
+            version,
+            stamps: stamps == 1,
         })
+    }
+
+    /// Returns the version to name in a refusal of a datagram: its own version if a server understands that.
+    #[must_use]
+    pub fn refused_version(bytes: &[u8]) -> u8 {
+        match bytes.strip_prefix(HELLO_MAGIC) {
+            Some(&[version @ OLDEST_HELLO_VERSION..=HELLO_VERSION, ..]) => version,
+            _ => HELLO_VERSION,
+        }
     }
 }
 
@@ -165,6 +227,10 @@ pub enum HelloReply {
     Welcome {
         /// Size of the client's receive buffer in bytes, as the kernel counts it.
         granted: u64,
+        /// The version of the client's hello.
+        version: u8,
+        /// True if frames come with time stamps of a timed bus. Version 2 cannot say so.
+        stamps: bool,
     },
     /// The server did not understand the hello.
     Refused {
@@ -176,17 +242,18 @@ pub enum HelloReply {
 impl HelloReply {
     /// Encodes the answer as a datagram.
     #[must_use]
-    pub fn encode(self) -> [u8; HELLO_REPLY_BYTES] {
-        let (code, version, granted) = match self {
-            Self::Welcome { granted } => (0, HELLO_VERSION, granted),
-            Self::Refused { version } => (1, version, 0),
+    pub fn encode(self) -> Vec<u8> {
+        let (code, version, granted, stamps) = match self {
+            Self::Welcome { granted, version, stamps } => (0, version, granted, stamps),
+            Self::Refused { version } => (1, version, 0, false),
         };
-        let mut bytes = [0; HELLO_REPLY_BYTES];
-        let (magic, rest) = bytes.split_at_mut(HELLO_MAGIC.len());
-        let (head, value) = rest.split_at_mut(2);
-        magic.copy_from_slice(HELLO_MAGIC);
-        head.copy_from_slice(&[version, code]);
-        value.copy_from_slice(&granted.to_le_bytes());
+        let mut bytes = Vec::with_capacity(HELLO_REPLY_BYTES + 1);
+        bytes.extend_from_slice(HELLO_MAGIC);
+        bytes.extend_from_slice(&[version, code]);
+        bytes.extend_from_slice(&granted.to_le_bytes());
+        if version > OLDEST_HELLO_VERSION {
+            bytes.push(stamps.into());
+        }
         bytes
     }
 
@@ -194,12 +261,53 @@ impl HelloReply {
     #[must_use]
     pub fn decode(bytes: &[u8]) -> Option<Self> {
         let &[version, code, ref value @ ..] = bytes.strip_prefix(HELLO_MAGIC)? else { return None };
-        let granted = u64::from_le_bytes(value.try_into().ok()?);
-        match (version, code) {
-            (HELLO_VERSION, 0) => Some(Self::Welcome { granted }),
-            (version, 1) => Some(Self::Refused { version }),
+        let (granted, rest) = value.split_first_chunk()?;
+        let granted = u64::from_le_bytes(*granted);
+        match (version, code, rest) {
+            (OLDEST_HELLO_VERSION, 0, []) => Some(Self::Welcome { granted, version, stamps: false }),
+            (HELLO_VERSION, 0, &[stamps @ 0..=1]) => {
+                Some(Self::Welcome { granted, version, stamps: stamps == 1 })
+            }
+            // A server of any other version may refuse, too.
+            (version, 1, _) => Some(Self::Refused { version }),
             _ => None,
         }
+    }
+}
+
+/// Splits a datagram into the bytes of a frame and its time stamp on a timed bus, in ns since 1970.
+#[must_use]
+pub fn split_stamp(bytes: &[u8]) -> (&[u8], Option<u64>) {
+    const STAMPED_CLASSIC_BYTES: usize = CLASSIC_BYTES + STAMP_BYTES;
+    match bytes.len() {
+        STAMPED_CLASSIC_BYTES | MAX_FRAME_DATAGRAM_BYTES => match bytes.split_last_chunk() {
+            Some((frame, stamp)) => (frame, Some(u64::from_le_bytes(*stamp))),
+            None => (bytes, None),
+        },
+        _ => (bytes, None),
+    }
+}
+
+/// Encodes a refusal notice: the total number of frames of a client that its transmit queue on a timed bus refused, and
+/// the identifier of the last one, with its flags.
+#[must_use]
+pub fn encode_refusal_notice(total: u32, id: u32) -> [u8; 9] {
+    let mut bytes = [b'R'; 9];
+    let (_, rest) = bytes.split_at_mut(1);
+    let words = total.to_le_bytes().into_iter().chain(id.to_le_bytes());
+    rest.iter_mut().zip(words).for_each(|(to, from)| *to = from);
+    bytes
+}
+
+/// Decodes a refusal notice. Returns the total number of refused frames and the identifier of the last one; `None` for
+/// any other datagram.
+#[must_use]
+pub const fn decode_refusal_notice(bytes: &[u8]) -> Option<(u32, u32)> {
+    match *bytes {
+        [b'R', a, b, c, d, e, f, g, h] => {
+            Some((u32::from_le_bytes([a, b, c, d]), u32::from_le_bytes([e, f, g, h])))
+        }
+        _ => None,
     }
 }
 
@@ -222,15 +330,15 @@ pub const fn decode_drop_notice(bytes: &[u8]) -> Option<u32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::can::{CLASSIC_BYTES, FD_BYTES};
     use proptest::prelude::*;
 
     fn any_hello() -> impl Strategy<Value = ClientHello> {
         let filters = proptest::collection::vec(any::<(u32, u32)>(), 0..20);
-        (filters, any::<(bool, bool, u32, u64)>()).prop_map(
-            |(filters, (own_frames, fd, error_mask, buffer))| {
+        (filters, any::<(bool, bool, u32, u64)>(), (2..=3_u8, any::<bool>())).prop_map(
+            |(filters, (own_frames, fd, error_mask, buffer), (version, stamps))| {
                 let filters = filters.into_iter().map(|(id, mask)| Filter { id, mask }).collect();
-                ClientHello { filters, own_frames, fd, error_mask, buffer }
+                let stamps = stamps && version == 3;
+                ClientHello { filters, own_frames, fd, error_mask, buffer, version, stamps }
             },
         )
     }
@@ -244,9 +352,15 @@ mod tests {
             fd: true,
             error_mask: 0x1FF,
             buffer: 0x10_0000,
+            version: 2,
+            stamps: false,
         };
         let expected = b"skinbus\x02\x01\x01\xff\x01\0\0\0\0\x10\0\0\0\0\0\0\x01\0\0\0\xff\x07\0\xc0";
         assert_eq!(hello.encode(), expected);
+        let newer = ClientHello { version: 3, stamps: true, ..hello }.encode();
+        assert_eq!(newer[..7], expected[..7]);
+        assert_eq!((newer[7], newer[22]), (3, 1));
+        assert_eq!((&newer[8..22], &newer[23..]), (&expected[8..22], &expected[23..]));
     }
 
     #[test]
@@ -257,16 +371,33 @@ mod tests {
                 let filters = vec![Filter::ALL; count];
                 FilterPart::split_filters(&filters).map(|part| part.encode().len()).collect::<Vec<_>>()
             }))
-            .chain([HelloReply::Refused { version: 1 }.encode().len(), encode_drop_notice(0).len()]);
-        assert!(lens.into_iter().all(|len| len != CLASSIC_BYTES && len != FD_BYTES && len != 0));
+            .chain((1..=3).map(|version| HelloReply::Refused { version }.encode().len()))
+            .chain([encode_drop_notice(0).len(), encode_refusal_notice(0, 0).len()]);
+        let frames = [CLASSIC_BYTES, FD_BYTES].map(|len| [len, len + STAMP_BYTES]);
+        assert!(lens.into_iter().all(|len| !frames.as_flattened().contains(&len) && len != 0));
     }
 
     #[test]
     fn a_hello_of_another_version_is_none() {
-        let mut bytes =
-            ClientHello { filters: vec![], own_frames: false, fd: true, error_mask: 0, buffer: 0 }.encode();
-        bytes[7] = HELLO_VERSION + 1;
-        assert_eq!(ClientHello::decode(&bytes), None);
+        let hello = ClientHello { stamps: true, ..ClientHello::default() };
+        for (version, stamps, refused) in [(4, 1, 3), (1, 0, 3), (2, 1, 2), (3, 2, 3)] {
+            let mut bytes = hello.encode();
+            (bytes[7], bytes[22]) = (version, stamps);
+            assert_eq!(ClientHello::decode(&bytes), None, "version {version}, stamps {stamps}");
+            assert_eq!(ClientHello::refused_version(&bytes), refused);
+        }
+        assert_eq!(ClientHello::refused_version(b"skinbu"), 3);
+    }
+
+    #[test]
+    fn a_stamp_follows_the_frame() {
+        for len in [CLASSIC_BYTES, FD_BYTES] {
+            let frame: Vec<_> = (0..len).map(|at| u8::try_from(at).unwrap()).collect();
+            assert_eq!(split_stamp(&frame), (frame.as_slice(), None));
+            let stamped = [&frame[..], &0x0102_0304_0506_0708_u64.to_le_bytes()].concat();
+            assert_eq!(split_stamp(&stamped), (frame.as_slice(), Some(0x0102_0304_0506_0708)));
+        }
+        assert_eq!(split_stamp(&[0; 25]), (&[0; 25][..], None));
     }
 
     proptest! {
@@ -290,11 +421,14 @@ mod tests {
         }
 
         #[test]
-        fn every_answer_comes_back(granted: u64, version: u8, total: u32) {
-            for answer in [HelloReply::Welcome { granted }, HelloReply::Refused { version }] {
+        fn every_answer_comes_back(granted: u64, version: u8, total: u32, id: u32, stamps: bool) {
+            let newer = HelloReply::Welcome { granted, version: 3, stamps };
+            let older = HelloReply::Welcome { granted, version: 2, stamps: false };
+            for answer in [newer, older, HelloReply::Refused { version }] {
                 prop_assert_eq!(HelloReply::decode(&answer.encode()), Some(answer));
             }
             prop_assert_eq!(decode_drop_notice(&encode_drop_notice(total)), Some(total));
+            prop_assert_eq!(decode_refusal_notice(&encode_refusal_notice(total, id)), Some((total, id)));
         }
 
         #[test]

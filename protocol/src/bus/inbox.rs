@@ -12,7 +12,7 @@ pub struct ReceivedFrame {
     /// The frame.
     pub frame: Frame,
     /// Time of arrival at this socket, in nanoseconds of the wall clock (`SO_TIMESTAMPNS`); 0 if the kernel
-    /// did not report it.
+    /// did not report it. On a timed bus the end of the frame on the bus.
     pub at_nanos: u64,
     /// True if the receiving socket itself sent the frame.
     pub own: bool,
@@ -26,6 +26,7 @@ pub struct Inbox {
     pub(super) failure: Option<io::Error>,
     frames: Vec<ReceivedFrame>,
     dropped: u32,
+    refused: u32,
     unreadable: u64,
 }
 
@@ -38,6 +39,7 @@ impl Inbox {
             failure: None,
             frames: Vec::with_capacity(MAX_BATCH_DATAGRAMS),
             dropped: 0,
+            refused: 0,
             unreadable: 0,
         }
     }
@@ -55,6 +57,13 @@ impl Inbox {
         self.dropped
     }
 
+    /// Returns the number of frames of this socket that the transmit queue of a timed bus has refused: a running total
+    /// that wraps.
+    #[must_use]
+    pub const fn refused_count(&self) -> u32 {
+        self.refused
+    }
+
     /// Returns the number of received datagrams that were neither a frame nor a drop notice; 0 unless the other end is
     /// faulty.
     #[must_use]
@@ -69,20 +78,26 @@ impl Inbox {
 
     /// Decodes the datagrams of the batch into frames. Returns true if the other end closed the connection after them.
     pub(super) fn decode(&mut self, carrier: &dyn BusBackend) -> bool {
-        let Self { batch, frames, dropped, unreadable, failure: _ } = self;
+        let Self { batch, frames, dropped, refused, unreadable, failure: _ } = self;
         frames.clear();
         for datagram in batch.datagrams() {
             let bytes = datagram.bytes();
             if bytes.is_some_and(<[u8]>::is_empty) {
                 return true;
             }
+            let (bytes, stamp) = bytes.map_or((None, None), |bytes| {
+                let (bytes, stamp) = carrier.split_stamp(bytes);
+                (Some(bytes), stamp)
+            });
             if let Some(Ok(frame)) = bytes.map(Frame::from_bytes) {
                 let notes = datagram.info();
                 *dropped = notes.dropped.unwrap_or(*dropped);
-                let at_nanos = notes.at_nanos.unwrap_or(0);
+                let at_nanos = stamp.or(notes.at_nanos).unwrap_or(0);
                 frames.push(ReceivedFrame { frame, at_nanos, own: carrier.is_own(datagram) });
             } else if let Some(total) = bytes.and_then(|bytes| carrier.decode_drop_notice(bytes)) {
                 *dropped = total;
+            } else if let Some(total) = bytes.and_then(|bytes| carrier.decode_refusal_notice(bytes)) {
+                *refused = total;
             } else {
                 *unreadable += 1;
             }

@@ -8,7 +8,7 @@ use rustix::net::{AddressFamily, Protocol, SocketFlags, SocketType, sockopt};
 use socketcan::{CanAddr, CanFdSocket, CanFilter, Socket, SocketOptions};
 
 use super::batch::{Datagram, ReceiveBatch};
-use super::carrier::BusBackend;
+use super::carrier::{BusBackend, OpenedSocket};
 use super::link::NetworkInterface;
 use super::{Bus, BusError, BusOptions, Filter};
 
@@ -43,7 +43,7 @@ fn probe_can_raw() -> Result<OwnedFd, Errno> {
 pub(super) struct SocketCanBackend;
 
 impl BusBackend for SocketCanBackend {
-    fn open(&self, name: &str, options: &BusOptions) -> Result<(CanFdSocket, usize), BusError> {
+    fn open(&self, name: &str, options: &BusOptions) -> Result<OpenedSocket, BusError> {
         let own = || name.to_owned();
         let failed = |source: io::Error| match source.raw_os_error() {
             Some(libc::ENETDOWN) => BusError::Down(own()),
@@ -70,7 +70,7 @@ impl BusBackend for SocketCanBackend {
             return Err(BusError::ClassicOnly { name: own(), mtu: link.mtu });
         }
         let granted = configure_socket(&socket, options).map_err(failed)?;
-        Ok((socket, granted))
+        Ok(OpenedSocket { socket, receive_buffer: granted, is_timed: false })
     }
 
     fn set_filters(&self, bus: &Bus, filters: &[Filter]) -> Result<(), BusError> {

@@ -1,10 +1,10 @@
 //! The buffer of one datagram, and the kernel's control messages about it.
 
-use crate::can::FD_BYTES;
+use super::embedded::MAX_FRAME_DATAGRAM_BYTES;
 
 /// The buffer of one datagram and its control messages.
 pub(super) struct DatagramBuffer {
-    pub(super) bytes: [u8; FD_BYTES],
+    pub(super) bytes: [u8; MAX_FRAME_DATAGRAM_BYTES],
     /// Control messages: a time stamp (32 bytes) and a drop count (24 bytes).
     pub(super) control: [u64; 8],
     pub(super) len: usize,

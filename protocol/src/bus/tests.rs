@@ -68,6 +68,7 @@ fn pair() -> (Bus, std::os::fd::OwnedFd) {
         kind: BusKind::Embedded,
         socket: near.into(),
         receive_buffer: 0,
+        is_timed: false,
         fd: true,
         send_timeout: Duration::from_millis(100),
         directory: Some("/nowhere".into()),

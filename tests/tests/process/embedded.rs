@@ -340,8 +340,7 @@ fn garbage_is_counted_and_hurts_nobody() {
 #[test]
 fn who_does_not_say_hello_is_turned_away() {
     let bench = Bench::new();
-    let mut other_version =
-        ClientHello { filters: vec![], own_frames: false, fd: true, error_mask: 0, buffer: 0 }.encode();
+    let mut other_version = ClientHello::default().encode();
     other_version[7] = HELLO_VERSION + 1;
     for first in [&frame(1, 1).to_bytes()[..], b"hello", &[0; 5000], &other_version] {
         let socket = bench.raw();

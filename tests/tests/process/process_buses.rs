@@ -334,7 +334,7 @@ impl PlayedServer {
                 break client;
             }
         };
-        let answer = HelloReply::Welcome { granted: 1 << 20 }.encode();
+        let answer = HelloReply::Welcome { granted: 1 << 20, version: 3, stamps: false }.encode();
         rustix::net::send(&client, &answer, SendFlags::NOSIGNAL).unwrap();
         client
     }

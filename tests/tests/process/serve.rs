@@ -294,7 +294,7 @@ fn greeted(listener: &OwnedFd, answer: HelloReply) -> OwnedFd {
     let mut bytes = [0; 64];
     let (len, _) = rustix::net::recv(&socket, &mut bytes, RecvFlags::empty()).unwrap();
     let filters = vec![Filter::ALL];
-    let hello = ClientHello { filters, own_frames: false, fd: true, error_mask: 0, buffer: 1 << 20 };
+    let hello = ClientHello { filters, buffer: 1 << 20, version: 2, ..ClientHello::default() };
     assert_eq!(ClientHello::decode(&bytes[..len]), Some(hello));
     rustix::net::send(&socket, &answer.encode(), SendFlags::empty()).unwrap();
     socket
@@ -308,7 +308,7 @@ fn the_documents_programs_read_to_the_end_and_say_when_they_are_refused() {
     rustix::net::listen(&listener, 1).unwrap();
     for listing in listings(folder.path()) {
         let program = attach(&listing, folder.path());
-        let socket = greeted(&listener, HelloReply::Welcome { granted: 1 << 21 });
+        let socket = greeted(&listener, HelloReply::Welcome { granted: 1 << 21, version: 2, stamps: false });
         for (frame, flags) in sent_by_listings().iter().zip([RecvFlags::empty(), RecvFlags::PEEK]) {
             let mut bytes = [0; 73];
             let (len, _) = rustix::net::recv(&socket, &mut bytes, flags).unwrap();

@@ -456,7 +456,7 @@ fn open(settings: &LinkSettings) -> Result<Bus, BusError> {
         directory: settings.directory.clone(),
         ..BusOptions::default()
     };
-    Bus::open(&settings.bus, settings.choice, &options)
+    Bus::open(&settings.bus, settings.choice, &options)?.without_time()
 }
 
 fn wall() -> u64 {

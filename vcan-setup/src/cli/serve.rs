@@ -1,14 +1,18 @@
 //! The command `vcan-setup serve`.
 
-use std::io::{Read, Write};
+use std::io::{BufRead, Write};
+use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixStream;
+use std::path::PathBuf;
 
 use anyhow::Context;
+use bus_model::{BitErrors, TransmitQueue};
 use clap::Args;
 use protocol::usage::Failure;
+use protocol::wire_time::BitRates;
 use rustix::process::{Resource, Rlimit, Signal, getrlimit, setrlimit};
 use signal_hook::consts::{SIGINT, SIGTERM};
-use vcan_setup::embedded::{BusTotals, Server};
+use vcan_setup::embedded::{BusRecord, BusTotals, Server, TimedBusOptions, TimedReport};
 
 use super::parse_bus_name;
 
@@ -27,14 +31,53 @@ pub(crate) struct ServeBusOptions {
     /// Name of the bus, like that of an interface: at most 15 bytes
     #[arg(value_parser = parse_bus_name)]
     name: String,
-    /// Also stop when standard input ends or the parent process dies
+    /// Also stop when standard input ends or the parent process dies. Each line "report" on standard input prints the
+    /// figures of a timed bus to standard output, as one JSON object
     #[arg(long)]
     until_eof: bool,
+    /// Let frames take time, as on a real bus with these bit rates: 1M/5M, or 500k for classic CAN. Frames are
+    /// arbitrated by identifier, and delivered at their ends; docs/reference/embedded-bus.md explains the model
+    #[arg(long, value_name = "RATES")]
+    rates: Option<BitRates>,
+    /// Transmit queue of each program: fifo or priority (lowest identifier first), and its depth in frames
+    #[arg(long, value_name = "ORDER:DEPTH", default_value = "priority:32", requires = "rates")]
+    queue: TransmitQueue,
+    /// Share of bits that arrive damaged, 0 to 0.01. Each causes an error frame and a retransmission
+    #[arg(long, value_name = "SHARE", default_value_t = 0.0, requires = "rates")]
+    bit_errors: f64,
+    /// Random seed for the damaged bits
+    #[arg(long, value_name = "N", default_value_t = 1, requires = "bit_errors")]
+    seed: u64,
+    /// Let frames that only a bench sends take time, too: stimuli, sync and report with their answers, simulated wires
+    #[arg(long, requires = "rates")]
+    bench_traffic: bool,
+    /// Write all requests and transmissions to this new file, a line each
+    #[arg(long, value_name = "FILE", requires = "rates")]
+    record: Option<PathBuf>,
 }
 
 impl ServeBusOptions {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        serve(&self.name, self.until_eof).map_err(|error| Failure::run_error(format_with_causes(&error)))
+        if let Err(error) = BitErrors::new(self.bit_errors, self.seed) {
+            return Err(Failure::usage_error(format!("--bit-errors: {error}")));
+        }
+        serve(&self).map_err(|error| Failure::run_error(format_with_causes(&error)))
+    }
+
+    /// Returns the properties of the timed bus; `None` if frames take no time.
+    fn timed_bus(&self) -> anyhow::Result<Option<TimedBusOptions>> {
+        let Some(rates) = self.rates else { return Ok(None) };
+        let create = |path: &PathBuf| {
+            BusRecord::create(path).with_context(|| format!("cannot create {}", path.display()))
+        };
+        Ok(Some(TimedBusOptions {
+            rates,
+            queue: self.queue,
+            bit_error_rate: self.bit_errors,
+            seed: self.seed,
+            counts_bench_traffic: self.bench_traffic,
+            record: self.record.as_ref().map(create).transpose()?,
+        }))
     }
 }
 
@@ -46,20 +89,26 @@ fn format_with_causes(error: &anyhow::Error) -> String {
     })
 }
 
-fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
+fn serve(options: &ServeBusOptions) -> anyhow::Result<()> {
+    let ServeBusOptions { name, until_eof, .. } = options;
+    let timed = options.timed_bus()?;
+    let (ask, asked) = UnixStream::pair().context("cannot create the socket pair that requests reports")?;
     let (stop, stopped) =
         UnixStream::pair().context("cannot create the socket pair that stops the server")?;
     for signal in [SIGINT, SIGTERM] {
         let stop = stop.try_clone().context("cannot create the socket pair that stops the server")?;
         signal_hook::low_level::pipe::register(signal, stop).context("cannot catch signals")?;
     }
-    if until_eof {
+    if *until_eof {
         // The signal is sent when the thread ends that started this process, because the system regards it as the
         // parent.
         rustix::process::set_parent_process_death_signal(Some(Signal::TERM))
             .context("cannot watch the parent process")?;
         let follow = move || {
-            let _ = std::io::copy(&mut std::io::stdin().lock().by_ref(), &mut std::io::sink());
+            let lines = std::io::stdin().lock().split(b'\n').map_while(Result::ok);
+            for _ in lines.filter(|line| line.trim_ascii() == b"report") {
+                let _ = (&ask).write_all(b"r");
+            }
             let _ = (&stop).write_all(b"end");
         };
         std::thread::Builder::new()
@@ -69,13 +118,20 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
     // The kernel delivers frames at once, but a server process may wait behind hundreds of cells for processor time. If
     // this process may not raise its priority, the bus is only slower.
     let _ = rustix::process::setpriority_process(None, HIGHEST_PRIORITY);
-    protocol::bus::set_batch_scheduling();
+    // A timed bus has to wake up at the ends of frames, though other processes run.
+    if timed.is_none() {
+        protocol::bus::set_batch_scheduling();
+    }
     raise_file_limit();
-    let server = Server::bind(name)?;
+    let mut server = Server::bind(name)?;
+    if let Some(timed) = timed {
+        server = server.with_time(timed)?;
+    }
     writeln!(std::io::stdout(), "serving {name} at {}", server.path().display())
         .and_then(|()| std::io::stdout().flush())
         .context("cannot write to standard output")?;
-    let BusTotals { garbage, refused, turned_away, failed, failure, .. } = server.run(stopped)?;
+    let totals = server.run_with_reports(stopped, &OwnedFd::from(asked), print_report)?;
+    let BusTotals { garbage, refused, turned_away, failed, failure, .. } = totals;
     // Only the server can report these frames, because a client gets no error for an invalid datagram.
     if garbage > 0 || refused > 0 {
         print_to_stderr(&format!(
@@ -104,6 +160,13 @@ fn raise_file_limit() {
     let Rlimit { maximum, .. } = getrlimit(Resource::Nofile);
     // With a lower limit the server accepts fewer clients.
     let _ = setrlimit(Resource::Nofile, Rlimit { current: maximum, maximum });
+}
+
+/// Prints the figures of a timed bus as one line. Ignores a failure, because the reader has ended.
+fn print_report(report: &TimedReport) {
+    let text = serde_json::to_string(report).unwrap_or_default();
+    let mut out = std::io::stdout();
+    let _ = writeln!(out, "{text}").and_then(|()| out.flush());
 }
 
 /// Prints a line to standard error. Ignores a failure, because it could not be reported.

@@ -4,7 +4,7 @@ use std::os::fd::OwnedFd;
 
 use protocol::bus::Filter;
 use protocol::bus::batch::{MAX_BATCH_DATAGRAMS, Outgoing, is_memory_shortage};
-use protocol::bus::embedded::{encode_drop_notice, peer_process};
+use protocol::bus::embedded::{encode_drop_notice, encode_refusal_notice, peer_process};
 use protocol::can::FD_BYTES;
 use rustix::event::epoll::{self, EventData, EventFlags};
 use rustix::io::Errno;
@@ -50,6 +50,10 @@ pub(super) struct Client {
     /// True once the client's first message, the hello, was received. The client gets frames only afterwards.
     pub(super) greeted: bool,
     pub(super) fd: bool,
+    /// True if the client gets time stamps of a timed bus, and reports of refused frames.
+    pub(super) stamps: bool,
+    /// The number of frames of the client that its transmit queue has refused.
+    refused: u32,
     /// The new filters that have arrived so far; `None` if no change of filters is in progress.
     pub(super) filters: Option<Vec<Filter>>,
     /// True while the client's socket is full. `epoll` reports when it has room.
@@ -71,6 +75,8 @@ impl Client {
             queue,
             greeted: false,
             fd: true,
+            stamps: false,
+            refused: 0,
             filters: None,
             blocked: false,
             dirty: false,
@@ -78,10 +84,16 @@ impl Client {
         }
     }
 
-    /// Queues a frame. Returns true if the client must be added to the list of clients to be flushed.
-    pub(super) fn enqueue(&mut self, parcel: FrameDatagram, post: &mut SendContext) -> bool {
+    /// Queues a frame, with its time stamp on a timed bus. Returns true if the client must be added to the list of
+    /// clients to be flushed.
+    pub(super) fn enqueue(
+        &mut self,
+        parcel: FrameDatagram,
+        stamp: Option<u64>,
+        post: &mut SendContext,
+    ) -> bool {
         post.totals.routed += 1;
-        if !self.queue.push(parcel) {
+        if !self.queue.push(parcel, stamp.filter(|_| self.stamps)) {
             post.totals.dropped += 1;
             return false;
         }
@@ -89,6 +101,17 @@ impl Client {
         if !self.blocked && self.queue.frame_count() >= MAX_BATCH_DATAGRAMS {
             let _ = self.send(post);
         }
+        !self.blocked && !std::mem::replace(&mut self.dirty, true)
+    }
+
+    /// Queues a report of a refused frame, if the client understands it. Returns true if the client must be added to the
+    /// list of clients to be flushed.
+    pub(super) fn enqueue_refusal(&mut self, raw_id: u32) -> bool {
+        self.refused = self.refused.wrapping_add(1);
+        if !self.stamps {
+            return false;
+        }
+        self.queue.push_refusal(self.refused, raw_id);
         !self.blocked && !std::mem::replace(&mut self.dirty, true)
     }
 
@@ -143,16 +166,18 @@ impl Client {
             post.outgoing.clear();
             for entry in self.queue.iter().take(MAX_BATCH_DATAGRAMS) {
                 match entry {
-                    QueueEntry::Frame(parcel) => post.outgoing.push(parcel.bytes(), parcel.byte_len()),
-                    QueueEntry::Dropped(total) => {
-                        let notice = encode_drop_notice(*total);
-                        let mut bytes = [0; FD_BYTES];
-                        for (to, from) in bytes.iter_mut().zip(notice) {
-                            *to = from;
-                        }
-                        post.outgoing.push(&bytes, notice.len())
+                    QueueEntry::Frame(parcel) => _ = post.outgoing.push(parcel.bytes(), parcel.byte_len()),
+                    QueueEntry::Stamped(stamp, parcel) => {
+                        post.outgoing.push(parcel.bytes(), parcel.byte_len());
+                        post.outgoing.append_stamp(*stamp);
                     }
-                };
+                    QueueEntry::Dropped(total) => {
+                        push_notice(&mut post.outgoing, &encode_drop_notice(*total))
+                    }
+                    QueueEntry::Refused(total, raw_id) => {
+                        push_notice(&mut post.outgoing, &encode_refusal_notice(*total, *raw_id));
+                    }
+                }
             }
             match post.outgoing.send(&self.socket) {
                 Ok(count) => post.totals.delivered += self.queue.remove_sent(count) as u64,
@@ -174,4 +199,12 @@ impl Client {
     fn set_epoll_flags(&self, post: &SendContext, flags: EventFlags) -> bool {
         epoll::modify(&post.epoll, &self.socket, EventData::new_u64(self.id.0 as u64), flags).is_ok()
     }
+}
+
+fn push_notice(outgoing: &mut Outgoing, notice: &[u8]) {
+    let mut bytes = [0; FD_BYTES];
+    for (to, from) in bytes.iter_mut().zip(notice) {
+        *to = *from;
+    }
+    outgoing.push(&bytes, notice.len());
 }

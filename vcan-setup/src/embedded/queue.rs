@@ -9,6 +9,11 @@ use super::parcel::FrameDatagram;
 pub enum QueueEntry {
     /// A frame.
     Frame(FrameDatagram),
+    /// A frame of a timed bus, with its end in ns since 1970.
+    Stamped(u64, FrameDatagram),
+    /// A report to the client: the total number of its frames that its transmit queue has refused, and the identifier of
+    /// the last one.
+    Refused(u32, u32),
     /// A report to the client: the total number of frames dropped for it so far.
     Dropped(u32),
 }
@@ -31,16 +36,28 @@ impl ClientQueue {
         Self { entries: VecDeque::new(), frames: 0, limit, dropped: 0, reported: 0 }
     }
 
-    /// Appends a frame. Returns false if there was no room; the frame is then dropped and counted.
-    pub fn push(&mut self, parcel: FrameDatagram) -> bool {
+    /// Appends a frame, with its time stamp on a timed bus. Returns false if there was no room; the frame is then dropped
+    /// and counted.
+    pub fn push(&mut self, parcel: FrameDatagram, stamp: Option<u64>) -> bool {
         if self.frames >= self.limit {
             self.dropped = self.dropped.wrapping_add(1);
             return false;
         }
         self.push_drop_report();
-        self.entries.push_back(QueueEntry::Frame(parcel));
+        self.entries.push_back(match stamp {
+            None => QueueEntry::Frame(parcel),
+            Some(stamp) => QueueEntry::Stamped(stamp, parcel),
+        });
         self.frames += 1;
         true
+    }
+
+    /// Appends a report of refused frames, in place of a report that is the last item.
+    pub fn push_refusal(&mut self, total: u32, raw_id: u32) {
+        if let Some(QueueEntry::Refused(..)) = self.entries.back() {
+            self.entries.pop_back();
+        }
+        self.entries.push_back(QueueEntry::Refused(total, raw_id));
     }
 
     /// Appends a report of the dropped frames, if their number has changed since the last report. Must also be called
@@ -60,7 +77,8 @@ impl ClientQueue {
     /// Removes the oldest `count` items after they were sent. Returns the number of frames among them.
     pub fn remove_sent(&mut self, count: usize) -> usize {
         let sent = self.entries.drain(..count.min(self.entries.len()));
-        let frames = sent.filter(|entry| matches!(entry, QueueEntry::Frame(_))).count();
+        let frames =
+            sent.filter(|entry| matches!(entry, QueueEntry::Frame(_) | QueueEntry::Stamped(..))).count();
         self.frames -= frames;
         frames
     }
@@ -91,10 +109,10 @@ mod tests {
     #[test]
     fn what_does_not_fit_is_dropped_and_reported_before_the_next_frame() {
         let mut queue = ClientQueue::new(2);
-        let kept: Vec<_> = (0..5).map(|id| queue.push(parcel(id))).collect();
+        let kept: Vec<_> = (0..5).map(|id| queue.push(parcel(id), None)).collect();
         assert_eq!(kept, [true, true, false, false, false]);
         assert_eq!(queue.remove_sent(2), 2);
-        assert!(queue.push(parcel(5)));
+        assert!(queue.push(parcel(5), None));
         assert_eq!(
             queue.iter().copied().collect::<Vec<_>>(),
             [QueueEntry::Dropped(3), QueueEntry::Frame(parcel(5))]
@@ -106,7 +124,7 @@ mod tests {
         let mut queue = ClientQueue::new(0);
         queue.push_drop_report();
         assert!(queue.is_empty());
-        queue.push(parcel(0));
+        queue.push(parcel(0), None);
         queue.push_drop_report();
         queue.push_drop_report();
         assert_eq!(queue.iter().copied().collect::<Vec<_>>(), [QueueEntry::Dropped(1)]);
@@ -122,6 +140,7 @@ mod tests {
             let mut hear = |queue: &mut ClientQueue| {
                 match queue.iter().next().copied() {
                     Some(QueueEntry::Dropped(total)) => missing = total,
+                    Some(QueueEntry::Stamped(..) | QueueEntry::Refused(..)) => unreachable!("never pushed"),
                     Some(QueueEntry::Frame(parcel)) => {
                         assert_eq!(parcel.raw_id(), heard + missing);
                         heard += 1;
@@ -133,7 +152,7 @@ mod tests {
             };
             for push in steps {
                 if push {
-                    queue.push(parcel(pushed));
+                    queue.push(parcel(pushed), None);
                     pushed += 1;
                 } else {
                     hear(&mut queue);

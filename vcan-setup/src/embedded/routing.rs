@@ -98,7 +98,7 @@ impl Router {
         if self.clients.len() <= client.0 {
             self.clients.resize_with(client.0 + 1, || None);
         }
-        let ClientHello { ref filters, own_frames, fd, error_mask, buffer: _ } = *hello;
+        let ClientHello { ref filters, own_frames, fd, error_mask, .. } = *hello;
         let wants = Subscription { filters: filters.clone(), own_frames, fd, error_mask, last: 0 };
         self.add_to_lists(client, &wants);
         if let Some(slot) = self.clients.get_mut(client.0) {
@@ -188,7 +188,7 @@ mod tests {
     use proptest::prelude::*;
 
     fn hello(filters: &[Filter]) -> ClientHello {
-        ClientHello { filters: filters.to_vec(), own_frames: false, fd: true, error_mask: 0, buffer: 0 }
+        ClientHello { filters: filters.to_vec(), ..ClientHello::default() }
     }
 
     /// Returns the clients that receive a frame, in ascending order, each with true if the frame is its own.
@@ -208,7 +208,7 @@ mod tests {
                 own_frames: case.own_frames,
                 fd: case.fd,
                 error_mask: case.error_mask,
-                buffer: 0,
+                ..ClientHello::default()
             };
             router.insert(ClientId(1), &hello);
             let from = usize::from(case.from_self);

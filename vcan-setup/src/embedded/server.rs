@@ -20,12 +20,15 @@ use super::client::{Client, SendContext, SendOutcome};
 use super::parcel::FrameDatagram;
 use super::place::{BusSocket, BusSocketError};
 use super::routing::{ClientId, Router};
+use super::timed::{BusClock, RoundEffects, TimedBus};
 
+pub use super::timed::TimedReport;
 pub use super::totals::BusTotals;
 
 mod admission;
 #[cfg(test)]
 mod tests;
+mod timed_rounds;
 
 /// The maximum number of batches read from one client before the next client is served. It is more than a send buffer
 /// holds.
@@ -37,6 +40,7 @@ const PAUSE: Duration = Duration::from_millis(1);
 const MAX_FAILURES: u32 = 1_000;
 const LISTENER: u64 = u64::MAX;
 const STOP: u64 = u64::MAX - 1;
+const REPORT: u64 = u64::MAX - 2;
 
 /// The reason why a bus cannot be served any longer.
 #[derive(Debug, Error)]
@@ -75,7 +79,22 @@ pub struct Server {
     /// The `epoll` tokens of sockets that are not polled until `resume_at`.
     paused: Vec<u64>,
     resume_at: Option<Instant>,
+    /// The bus on which frames take time; `None` if they are passed on at once.
+    timed: Option<Box<TimedRounds>>,
 }
+
+/// A timed bus with its clock.
+#[derive(Debug)]
+struct TimedRounds {
+    bus: TimedBus,
+    clock: BusClock,
+    /// The difference by which times of the wall clock are to be increased in this round, in ns.
+    wall_offset: i64,
+    effects: RoundEffects,
+}
+
+/// A function that takes the figures of a timed bus.
+type ReportSink<'a> = &'a mut dyn FnMut(&TimedReport);
 
 /// A source of datagrams. Tests replace it to simulate errors.
 trait Receive {
@@ -126,6 +145,7 @@ impl Server {
             post: SendContext { epoll, outgoing: Box::default(), totals: BusTotals::default() },
             paused: Vec::new(),
             resume_at: None,
+            timed: None,
         })
     }
 
@@ -147,27 +167,53 @@ impl Server {
     /// # Errors
     /// Returns [`ServeError`] if a system call fails, which no client can cause.
     pub fn run(self, stop: impl AsFd) -> Result<BusTotals, ServeError> {
-        self.run_with(stop, ReceiveBatch::new())
+        self.run_with(stop, None, ReceiveBatch::new())
     }
 
-    fn run_with(mut self, stop: impl AsFd, mut batch: impl Receive) -> Result<BusTotals, ServeError> {
+    /// Serves the bus as [`Server::run`] does, and calls a function with the figures of a timed bus for each byte that
+    /// can be read from a socket.
+    ///
+    /// # Errors
+    /// Returns [`ServeError`] as [`Server::run`] does.
+    pub fn run_with_reports(
+        self,
+        stop: impl AsFd,
+        requests: &OwnedFd,
+        mut report: impl FnMut(&TimedReport),
+    ) -> Result<BusTotals, ServeError> {
+        self.run_with(stop, Some((requests, &mut report)), ReceiveBatch::new())
+    }
+
+    fn run_with(
+        mut self,
+        stop: impl AsFd,
+        mut reports: Option<(&OwnedFd, ReportSink<'_>)>,
+        mut batch: impl Receive,
+    ) -> Result<BusTotals, ServeError> {
         let name = self.name.clone();
         let failed = |doing, errno: Errno| ServeError::Io { name: name.clone(), doing, source: errno.into() };
         epoll::add(&self.post.epoll, &stop, EventData::new_u64(STOP), EventFlags::IN)
             .map_err(|errno| failed("watch for the stop request", errno))?;
+        if let Some((requests, _)) = &reports {
+            epoll::add(&self.post.epoll, requests, EventData::new_u64(REPORT), EventFlags::IN)
+                .map_err(|errno| failed("watch for requests of reports", errno))?;
+        }
         let mut events = Vec::with_capacity(256);
         loop {
             events.clear();
             let pause = self.resume_at.map(|at| at.saturating_duration_since(Instant::now()));
+            let pause = pause.into_iter().chain(self.time_to_round_end()).min();
             let timeout = pause.and_then(|pause| Timespec::try_from(pause).ok());
             match epoll::wait(&self.post.epoll, spare_capacity(&mut events), timeout.as_ref()) {
                 Ok(_) | Err(Errno::INTR) => {}
                 Err(errno) if is_memory_shortage(&errno.into()) => std::thread::sleep(PAUSE),
                 Err(errno) => return Err(failed("wait", errno)),
             }
+            self.begin_timed_round();
             for &epoll::Event { flags, data } in &events {
                 match data.u64() {
                     STOP => return Ok(self.end()),
+                    REPORT => self.answer_report_requests(&mut reports),
                     LISTENER => self.accept_clients(),
                     token => {
                         if let Ok(index) = usize::try_from(token) {
@@ -179,9 +225,11 @@ impl Server {
             if self.resume_at.is_some_and(|at| at <= Instant::now()) {
                 self.resume();
             }
+            self.end_timed_round();
             while let Some(id) = self.dirty.pop_front() {
                 self.flush(id);
             }
+            self.note_delivered();
         }
     }
 
@@ -285,7 +333,13 @@ impl Server {
                     }
                 }
                 match bytes.and_then(|bytes| FrameDatagram::from_client_datagram(bytes, fd)) {
-                    Some(parcel) => self.route(id, parcel),
+                    Some(parcel) => match &mut self.timed {
+                        None => self.route(id, parcel, None),
+                        Some(timed) => {
+                            self.post.totals.frames += 1;
+                            timed.collect(id, parcel, datagram);
+                        }
+                    },
                     None if bytes.is_some_and(|bytes| self.refilter(id, bytes)) => {}
                     None => self.post.totals.garbage += 1,
                 }
@@ -343,9 +397,10 @@ impl Server {
         }
     }
 
-    fn route(&mut self, from: ClientId, parcel: FrameDatagram) {
+    /// Queues a frame for all clients that receive it, with its time stamp on a timed bus.
+    fn route(&mut self, from: ClientId, parcel: FrameDatagram, stamp: Option<u64>) {
         let Self { router, clients, dirty, post, .. } = self;
-        post.totals.frames += 1;
+        post.totals.frames += u64::from(stamp.is_none());
         router.route(from, parcel.raw_id(), parcel.format(), |to, own| {
             // The kernel stamps a frame when it is sent to the client. If the process has a second socket, its queue is
             // therefore sent first, so that the time stamps of both sockets are in order.
@@ -354,7 +409,7 @@ impl Server {
                 sibling.send_now(post);
             }
             let Some(client) = clients.get_mut(to.0).and_then(Option::as_mut) else { return };
-            if client.enqueue(parcel.with_own_mark(own), post) {
+            if client.enqueue(parcel.with_own_mark(own), stamp, post) {
                 dirty.push_back(to);
             }
         });
@@ -403,6 +458,9 @@ impl Server {
     fn remove_client(&mut self, id: ClientId) {
         self.unsubscribe(id);
         self.paused.retain(|token| *token != id.0 as u64);
+        if let Some(timed) = &mut self.timed {
+            timed.bus.forget_client(id);
+        }
         let client = self.clients.get_mut(id.0).and_then(Option::take);
         if let Some(sibling) = client.and_then(|client| client.sibling).and_then(|id| self.client(id)) {
             sibling.sibling = None;

@@ -29,7 +29,7 @@ pub(super) fn open(settings: &BridgeSettings, line: &LineOptions) -> Result<Bus,
         directory: settings.directory.clone(),
         ..BusOptions::default()
     };
-    let open = |options: &BusOptions| Bus::open(&settings.bus, settings.choice, options);
+    let open = |options: &BusOptions| Bus::open(&settings.bus, settings.choice, options)?.without_time();
     match open(&options) {
         Err(BusError::ClassicOnly { .. }) if line.classic => {
             options.fd = false;

@@ -15,3 +15,4 @@ pub mod listen;
 pub mod realtime;
 pub mod roots;
 pub mod served;
+pub mod time;

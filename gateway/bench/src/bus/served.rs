@@ -1,12 +1,16 @@
 //! Embedded buses that this gateway serves, each in a process of its own.
 
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
-use std::process::{Child, Command, ExitStatus, Stdio};
+use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
+use std::time::Duration;
 
 use protocol::bus::{Bus, BusError, BusOptions, KindChoice};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use thiserror::Error;
+use vcan_setup::embedded::TimedReport;
 
+use super::time::{BusTimeError, ServedTime, check_bus_time};
 use crate::processes::{LaunchError, isolate_process_group, program_path, spawn, wait_or_kill};
 
 /// An embedded bus in a process of its own, which removes its socket even if the gateway is killed.
@@ -14,33 +18,55 @@ use crate::processes::{LaunchError, isolate_process_group, program_path, spawn, 
 pub struct ServedBus {
     bus: String,
     child: Child,
+    /// The lines that the server prints; `None` until it serves.
+    output: Option<BufReader<ChildStdout>>,
+    /// True if frames take time on the bus.
+    is_timed: bool,
 }
+
+/// Time that a server has to report its figures.
+const REPORT_TIMEOUT: Duration = Duration::from_secs(2);
 
 impl ServedBus {
     /// Serves a bus, in `directory` or else in the usual one, and waits until clients can connect.
     ///
     /// # Errors
     /// Returns [`LaunchError`] if the program does not start or does not report that it serves the bus.
-    pub fn start(program: &Path, bus: &str, directory: Option<&Path>) -> Result<Self, LaunchError> {
-        let mut served = Self::spawn_server(program, bus, directory)?;
+    pub fn start(
+        program: &Path,
+        bus: &str,
+        directory: Option<&Path>,
+        time: Option<ServedTime>,
+    ) -> Result<Self, LaunchError> {
+        let mut served = Self::spawn_server(program, bus, directory, time)?;
         served.wait_until_serving(program)?;
         Ok(served)
     }
 
     /// Starts the program, which will serve the bus.
-    fn spawn_server(program: &Path, bus: &str, directory: Option<&Path>) -> Result<Self, LaunchError> {
+    fn spawn_server(
+        program: &Path,
+        bus: &str,
+        directory: Option<&Path>,
+        time: Option<ServedTime>,
+    ) -> Result<Self, LaunchError> {
         let mut command = Command::new(program);
-        command.args(["serve", bus, "--until-eof"]).stdin(Stdio::piped()).stdout(Stdio::piped());
+        command.args(["serve", bus, "--until-eof"]);
+        if let Some(ServedTime { rates, queue }) = time {
+            command.args(["--rates", &rates.to_string(), "--queue", &queue.to_string()]);
+        }
+        command.stdin(Stdio::piped()).stdout(Stdio::piped());
         isolate_process_group(&mut command, directory);
-        Ok(Self { bus: bus.to_owned(), child: spawn(&mut command)? })
+        let child = spawn(&mut command)?;
+        Ok(Self { bus: bus.to_owned(), child, output: None, is_timed: time.is_some() })
     }
 
     /// Waits until clients can connect.
     fn wait_until_serving(&mut self, program: &Path) -> Result<(), LaunchError> {
         let start = |source| LaunchError::Start { path: program.to_owned(), source };
         let mut line = String::new();
-        if let Some(out) = self.child.stdout.take() {
-            BufReader::new(out).read_line(&mut line).map_err(start)?;
+        if let Some(output) = self.child.stdout.take() {
+            self.output.insert(BufReader::new(output)).read_line(&mut line).map_err(start)?;
         }
         if line.starts_with("serving ") {
             return Ok(());
@@ -58,6 +84,22 @@ impl ServedBus {
     #[must_use]
     pub fn bus_name(&self) -> &str {
         &self.bus
+    }
+
+    /// Returns the figures of the bus; `None` if frames take no time on it, or if the server does not answer.
+    pub fn report(&mut self) -> Option<TimedReport> {
+        let Self { child, output, is_timed: true, .. } = self else { return None };
+        let (stdin, output) = (child.stdin.as_mut()?, output.as_mut()?);
+        stdin.write_all(b"report\n").and_then(|()| stdin.flush()).ok()?;
+        let mut polled = [PollFd::new(output.get_ref(), PollFlags::IN)];
+        let wait = Timespec::try_from(REPORT_TIMEOUT).ok()?;
+        if rustix::io::retry_on_intr(|| poll(&mut polled, Some(&wait))).ok()? == 0 {
+            self.is_timed = false;
+            return None;
+        }
+        let mut line = String::new();
+        output.read_line(&mut line).ok()?;
+        serde_json::from_str(&line).ok()
     }
 
     /// Ends the server process. The process removes its socket, and clients find a closed connection.
@@ -83,10 +125,23 @@ pub enum ServeError {
     /// The server does not start.
     #[error(transparent)]
     Launch(#[from] LaunchError),
+    /// Frames do not take time on the bus, though they must.
+    #[error(transparent)]
+    Time(#[from] BusTimeError),
 }
 
-/// A bus to open: its name, its kind and its options.
-pub type BusTarget<'a> = (&'a str, KindChoice, BusOptions);
+/// A bus to open.
+#[derive(Clone, Debug)]
+pub struct BusTarget<'a> {
+    /// Name of the bus.
+    pub name: &'a str,
+    /// Kind of the bus.
+    pub kind: KindChoice,
+    /// Options for opening it.
+    pub options: BusOptions,
+    /// Time that frames take on it; `None` if the user does not ask for any.
+    pub time: Option<ServedTime>,
+}
 
 /// Action for a bus that exists neither as an interface nor as an embedded bus, if its kind is [`KindChoice::Auto`].
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -102,12 +157,11 @@ pub enum AbsentBusAction {
 /// # Errors
 /// Returns [`ServeError`] if the bus does not open or cannot be served.
 pub fn open_or_serve(
-    name: &str,
-    kind: KindChoice,
-    target: &BusOptions,
+    target: BusTarget<'_>,
     absent: AbsentBusAction,
 ) -> Result<(Bus, Option<ServedBus>), ServeError> {
-    let (opened, mut served) = open_or_serve_all(&[(name, kind, target.clone())], absent)?;
+    let name = target.name;
+    let (opened, mut served) = open_or_serve_all(&[target], absent)?;
     let bus = opened.into_iter().next().ok_or_else(|| BusError::Name(name.to_owned()))?;
     Ok((bus, served.pop()))
 }
@@ -121,31 +175,33 @@ pub fn open_or_serve_all(
     absent: AbsentBusAction,
 ) -> Result<(Vec<Bus>, Vec<ServedBus>), ServeError> {
     let mut begun = Vec::with_capacity(buses.len());
-    for (name, kind, target) in buses {
-        let opened = Bus::open(name, *kind, target);
+    for BusTarget { name, kind, options, time } in buses {
+        let opened = Bus::open(name, *kind, options);
         let is_served = matches!(opened, Err(BusError::NotServed { .. }))
             || (absent == AbsentBusAction::Create && matches!(opened, Err(BusError::Absent { .. })));
         begun.push(match opened {
             Err(_) if is_served => {
                 let program = program_path("vcan-setup")?;
                 let name = kind.served_kind().served_name(name);
-                Err(ServedBus::spawn_server(&program, &name, target.directory.as_deref())
+                Err(ServedBus::spawn_server(&program, &name, options.directory.as_deref(), *time)
                     .map(|served| (program, served))?)
             }
             opened => Ok(opened?),
         });
     }
     let (mut opened, mut all_served) = (Vec::with_capacity(buses.len()), Vec::new());
-    for ((name, kind, target), begun) in buses.iter().zip(begun) {
-        opened.push(match begun {
+    for (BusTarget { name, kind, options, time }, begun) in buses.iter().zip(begun) {
+        let bus = match begun {
             Ok(bus) => bus,
             Err((program, mut served)) => {
                 served.wait_until_serving(&program)?;
                 all_served.push(served);
                 // Not by the user's choice: an interface of this name may have appeared meanwhile.
-                Bus::open(name, KindChoice::Only(kind.served_kind()), target)?
+                Bus::open(name, KindChoice::Only(kind.served_kind()), options)?
             }
-        });
+        };
+        check_bus_time(&bus, *time)?;
+        opened.push(bus);
     }
     Ok((opened, all_served))
 }

@@ -53,6 +53,7 @@ use self::sine::RecordedSine;
 use self::start::BusRoutes;
 use self::survey::{Survey, TimeRange};
 use crate::bus::realtime::idle_lateness;
+use crate::bus::time::BusTimeChoice;
 use crate::processes::ended::EndedProcesses;
 use crate::progress::Progress;
 use crate::setup::format_cells;
@@ -81,6 +82,8 @@ pub struct ReplayOptions {
     pub files: Vec<PathBuf>,
     /// Kind of each bus.
     pub kinds: KindChoices,
+    /// Whether frames take time on the embedded buses that the replay serves for its cells.
+    pub bus_time: BusTimeChoice,
     /// Selection of the frames by their sender.
     pub only: SenderFilter,
     /// Buses of the capture whose frames are sent; empty for all.

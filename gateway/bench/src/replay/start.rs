@@ -20,7 +20,7 @@ use super::survey::Survey;
 use super::{ReplayError, ReplayOptions, SpawnOptions};
 use crate::bus::listen::{self, Listener};
 use crate::bus::roots::{ReceiveFilter, RootWires};
-use crate::bus::served::{AbsentBusAction, ServedBus, open_or_serve};
+use crate::bus::served::{AbsentBusAction, BusTarget, ServedBus, open_or_serve};
 use crate::processes::{CellLaunch, GATEWAY_DETECTION_TIME, Processes, create_memory_file, program_path};
 use crate::setup::format_cells;
 use model::decode::Decoded;
@@ -191,7 +191,11 @@ pub(super) fn open_buses(
         };
         let (bus, served_here) = match skin_override {
             Some(_) => {
-                open_or_serve(name, options.kinds.kind_of(name), &bus_options, AbsentBusAction::Create)?
+                let kind = options.kinds.kind_of(name);
+                let time =
+                    spawned_skin.and_then(|(skin, bus)| options.bus_time.served_time(skin.buses.get(bus)?));
+                let target = BusTarget { name, kind, options: bus_options, time };
+                open_or_serve(target, AbsentBusAction::Create)?
             }
             None => match Bus::open(name, options.kinds.kind_of(name), &bus_options) {
                 Err(error) if options.expect.is_some() && error.may_open_later() => {

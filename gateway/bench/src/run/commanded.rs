@@ -205,7 +205,9 @@ fn commands_sent(links: &[RunBus], bus: usize) -> u64 {
 /// Starts a server for an embedded bus.
 pub(super) fn start_bus_server(options: &RunOptions, bus: &str) -> Result<ServedBus, LaunchError> {
     let program = program_path("vcan-setup")?;
-    ServedBus::start(&program, bus, options.directory.as_deref())
+    let described = options.skin.buses.iter().find(|described| described.name == bus);
+    let time = described.and_then(|described| options.bus_time.served_time(described));
+    ServedBus::start(&program, bus, options.directory.as_deref(), time)
 }
 
 /// Finds a cell of the skin.

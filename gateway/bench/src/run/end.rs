@@ -16,7 +16,9 @@ use super::watch::MAIN_THREAD_INTERVAL;
 use crate::error::RunError;
 use crate::record::feed::UnrecordedCounts;
 use crate::record::{Recorder, backlog};
-use crate::summary::{BusSummary, CellSummary, LoopSummary, NetworkSummary, OutagesSummary, Summary};
+use crate::summary::{
+    BusSummary, CellSummary, LoopSummary, NetworkSummary, OutagesSummary, Summary, TimedReport,
+};
 use crate::view::BusView;
 use model::quantiles::Quantiles;
 use model::table::{ResponseFlags, TorqueAccuracy};
@@ -31,12 +33,29 @@ impl Bench<'_> {
         let mut summary = Summary::for_unstarted_run(&self.options.skin);
         let mut measured = LoopTotals::new();
         let failure = self.control_loop(&mut summary, &mut measured).err().map(|error| error.to_string());
+        let timed = self.timed_reports();
         let received = self.stop_receivers();
         summary.recording = self.finish_recording(&received);
         if failure.is_some() {
             self.print_kept_files(summary.recording.as_ref());
         }
-        self.summarise(summary, &measured, &received).with_verdict(failure)
+        self.summarise(summary, &measured, &received, timed).with_verdict(failure)
+    }
+
+    /// Returns the figures of the timed buses that this run serves, each with the name of the bus.
+    fn timed_reports(&mut self) -> Vec<(String, TimedReport)> {
+        let reports =
+            self.served.iter_mut().map(|served| Some((served.bus_name().to_owned(), served.report()?)));
+        reports.flatten().collect()
+    }
+
+    /// Waits until the transmit queues of timed buses are empty, so that what they still hold is not missing.
+    fn wait_for_transmit_queues(&mut self) {
+        let give_up = Instant::now() + FINAL_REPORT_TIMEOUT;
+        let is_waiting = |(_, report): &(String, TimedReport)| report.waiting > 0;
+        while self.timed_reports().iter().any(is_waiting) && Instant::now() < give_up {
+            thread::sleep(MAIN_THREAD_INTERVAL);
+        }
     }
 
     /// Ends a bench whose loop never started.
@@ -48,7 +67,8 @@ impl Bench<'_> {
         if error.exit_code() != 1 {
             return Err(error);
         }
-        Ok(self.summarise(summary, &LoopTotals::new(), &received).with_verdict(Some(error.to_string())))
+        let summary = self.summarise(summary, &LoopTotals::new(), &received, Vec::new());
+        Ok(summary.with_verdict(Some(error.to_string())))
     }
 
     /// Prints the paths of the files that contain the frames received before a failure.
@@ -62,9 +82,10 @@ impl Bench<'_> {
     }
 
     /// Waits for late replies, and requests the counters and a last heartbeat of all cells.
-    pub(super) fn request_final_reports(&self, interrupted: bool) -> Result<(), RunError> {
+    pub(super) fn request_final_reports(&mut self, interrupted: bool) -> Result<(), RunError> {
         let two_periods = Duration::try_from_secs_f64(2.0 / self.options.skin.timing.broadcast_hz());
         thread::sleep(two_periods.unwrap_or_default());
+        self.wait_for_transmit_queues();
         self.wait_until(Self::have_receivers_caught_up);
         self.send_to_all(&Message::Report)?;
         self.wait_until(|bench| {
@@ -131,13 +152,26 @@ impl Bench<'_> {
         summary: Summary,
         measured: &LoopTotals,
         received: &[Option<ReceiverResult>],
+        timed: Vec<(String, TimedReport)>,
     ) -> Summary {
         let backlog_dropped = backlog::dropped_packets()
             .zip(self.backlog_dropped)
             .map(|(now, before)| now.saturating_sub(before));
         let all = received.iter().flatten().map(|received| received.table.accuracy());
+        let mut cells = self.cell_summaries(received);
+        let mut buses = self.bus_summaries(received, backlog_dropped, measured);
+        for (name, report) in timed {
+            cells
+                .iter_mut()
+                .filter(|cell| cell.bus == name)
+                .for_each(|cell| cell.attribute_refusals(&report));
+            if let Some(bus) = buses.iter_mut().find(|bus| bus.name == name) {
+                *bus = std::mem::take(bus).with_time(report);
+                bus.replies.attribute_refusals(cells.iter().filter(|cell| cell.bus == name));
+            }
+        }
         Summary {
-            cells: self.cell_summaries(received),
+            cells,
             cell_errors: self.ended.errors(),
             halted: measured.halts.present_halt_reason().map(str::to_owned),
             halts: measured.halts.halt_summaries(),
@@ -147,7 +181,7 @@ impl Bench<'_> {
             control: self.loop_summary(measured, summary.control),
             accuracy: all.fold(TorqueAccuracy::default(), TorqueAccuracy::merged),
             backlog_dropped,
-            buses: self.bus_summaries(received, backlog_dropped, measured),
+            buses,
             ..summary
         }
     }

@@ -37,6 +37,7 @@ use protocol::skin::Skin;
 
 use self::commander::RemoteControl;
 pub use self::network::TreeTooDeep;
+use crate::bus::time::BusTimeChoice;
 use crate::emulate::EmulatedCells;
 pub use crate::error::RunError;
 use crate::remote::Remote;
@@ -56,6 +57,8 @@ pub struct RunOptions {
     pub kinds: KindChoices,
     /// Directory of embedded buses; `None` for the usual one.
     pub directory: Option<PathBuf>,
+    /// Whether frames take time on embedded buses.
+    pub bus_time: BusTimeChoice,
     /// True if the run starts the cells; otherwise they must be on the bus already.
     pub spawn: bool,
     /// Cells to emulate and their firmware; the other cells are processes.

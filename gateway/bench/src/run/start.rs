@@ -94,7 +94,7 @@ pub(super) fn start(options: &RunOptions) -> Result<Bench<'_>, RunError> {
     let (opened, own) = open_or_serve_all(&targets, action_if_bus_absent(options))?;
     served.extend(own);
     let opened = skin.buses.iter().zip(targets).zip(opened);
-    let opened = opened.map(|((bus, (.., target)), opened)| create_link(options, bus, target, opened));
+    let opened = opened.map(|((bus, target), opened)| create_link(options, bus, target.options, opened));
     let opened = opened.collect::<Result<Vec<_>, _>>()?;
     let shared = Arc::new(SharedRunState::default());
     let (tell, bus_event) = mpsc::channel();
@@ -178,8 +178,9 @@ fn start_emulated_cells(
         let target =
             BusOptions { filters: Vec::new(), directory: directory.clone(), ..BusOptions::default() };
         let target = BusOptions { fd: bus.format == Format::Fd, ..target };
-        let (_, own) =
-            open_or_serve(&bus.name, kinds.kind_of(&bus.name), &target, action_if_bus_absent(options))?;
+        let time = options.bus_time.served_time(bus);
+        let target = BusTarget { name: &bus.name, kind: kinds.kind_of(&bus.name), options: target, time };
+        let (_, own) = open_or_serve(target, action_if_bus_absent(options))?;
         served.extend(own);
     }
     let bench =
@@ -210,7 +211,8 @@ fn bus_target<'a>(options: &RunOptions, described: &'a skin::SkinBus, filters: V
         send_timeout: SEND_TIMEOUT,
         directory: options.directory.clone(),
     };
-    (name, options.kinds.kind_of(name), target)
+    let time = options.bus_time.served_time(described);
+    BusTarget { name, kind: options.kinds.kind_of(name), options: target, time }
 }
 
 /// Creates the link of an opened bus.

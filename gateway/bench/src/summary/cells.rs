@@ -7,7 +7,7 @@ use protocol::skin::{self, Skin};
 use serde::Serialize;
 
 /// Replies of cells that answer with their own torques. They add up: due = in time + late + missing; missing = too late
-/// + skipped + not heard + lost + in doubt + unknown.
+/// + skipped + not heard + lost + refused + in doubt + unknown.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct RepliesSummary {
     /// Number of epochs that cells had to answer, added up over the cells.
@@ -24,6 +24,8 @@ pub struct RepliesSummary {
     pub not_heard: u64,
     /// Replies that the cell sent and that were lost or damaged on the way.
     pub lost: u64,
+    /// Replies that the transmit queue of a timed bus refused.
+    pub refused: u64,
     /// Missing replies of cells that were dead or restarted, or whose bus was lost.
     pub in_doubt: u64,
     /// Missing replies without a known reason.
@@ -64,12 +66,13 @@ impl RepliesSummary {
 
     /// Returns the numbers of missing replies by reason; unknown reasons are last.
     #[must_use]
-    pub const fn missing_replies_by_reason(&self) -> [(&'static str, u64); 6] {
+    pub const fn missing_replies_by_reason(&self) -> [(&'static str, u64); 7] {
         [
             ("too_late", self.too_late),
             ("skipped", self.skipped),
             ("not_heard", self.not_heard),
             ("lost", self.lost),
+            ("refused", self.refused),
             ("in_doubt", self.in_doubt),
             ("unknown", self.unknown),
         ]

@@ -328,6 +328,7 @@ fn add_explained_losses(look_at: &mut Vec<String>, bus: &BusSummary) {
     let reasons = [
         (replies.lost, "lost on the way to the gateway"),
         (replies.not_heard, "not sent, because the cell did not receive the joints message"),
+        (replies.refused, "refused by the transmit queues of the timed bus"),
         (replies.in_doubt, "uncertain, because the cell was silent or restarted, or the bus was lost"),
     ];
     let missing = nonzero_counts(reasons);
@@ -339,6 +340,7 @@ fn add_explained_losses(look_at: &mut Vec<String>, bus: &BusSummary) {
         (up.backlog, "dropped by the kernel's backlog (net.core.netdev_max_backlog)"),
         (up.outage, "lost while the bus was down"),
         (up.hosts, "lost between hosts"),
+        (up.queues, "refused by the transmit queues of the timed bus"),
         (up.rejected, "damaged"),
         (up.in_doubt, "uncertain, because the cell restarted afterwards"),
         (up.surplus, "more than the cells sent: duplicates, or from another sender"),
@@ -404,10 +406,11 @@ fn add_late_replies(look_at: &mut Vec<String>, bus: &BusSummary) {
     ]);
     if !parts.is_empty() {
         look_at.push(format!(
-            "{} on {}: {}; this machine was busy, or the cells are slow; -v shows the times",
+            "{} on {}: {}; {}; -v shows the times",
             count_noun(due, "reply due", "replies due"),
             bus.name,
-            parts.join(", ")
+            parts.join(", "),
+            bus.lateness_cause()
         ));
     }
     if let Some(parts) = bus.sums.map(|sums| sums.contributions).filter(|parts| parts.late > 0) {

@@ -327,7 +327,7 @@ fn what_the_document_says_adds_up_does() {
     let up = bus.uplink;
     assert_eq!(
         up.sent + up.surplus,
-        up.delivered + up.rejected + up.unheard + up.dropped + up.unknown,
+        up.delivered + up.rejected + up.unheard + up.dropped + up.queues + up.unknown,
         "{up:?}"
     );
     let replies = bus.replies;

@@ -7,7 +7,7 @@ use crate::print::{KeyValueTable, comma_separated, count_with_noun};
 
 pub(super) fn add_frame_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     let up = &bus.uplink;
-    let lost = up.dropped + up.backlog + up.outage + up.hosts + up.unknown;
+    let lost = up.dropped + up.backlog + up.outage + up.hosts + up.queues + up.unknown;
     let odd = up.rejected + up.surplus + up.outsiders + up.in_doubt + u64::from(up.restarts);
     if is_verbose || lost + odd > 0 {
         add_packet_rows(rows, bus, lost);
@@ -33,6 +33,23 @@ pub(super) fn add_frame_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verb
     }
 }
 
+/// Adds rows on the frames of a timed bus.
+pub(super) fn add_timed_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
+    let Some(timed) = &bus.timed else { return };
+    let load = timed.load.map_or_else(|| "-".to_owned(), |load| format!("{:.1} %", load * 100.0));
+    rows.add_row("  bus load", load, format!("frames take time: {}, {}", timed.rates, timed.queue));
+    let [wait, delay] = [timed.wait_us, timed.delay_us]
+        .map(|it| format!("{:.0} / {:.0} / {:.0} / {:.0}", it.p50, it.p90, it.p99, it.max));
+    rows.add_row("  frames take, µs", wait, "from request to end");
+    if is_verbose || timed.behind > 0 {
+        let behind =
+            format!("delivered after the end; {} by over 1 ms", count_with_noun(timed.behind, "time"));
+        rows.add_row("  server late, µs", delay, behind);
+    }
+    rows.add_row_unless_zero("  damaged frames", timed.damaged, "sent again");
+    rows.add_row_unless_zero("  refused frames", timed.refused, "a transmit queue was full");
+}
+
 /// Adds rows on the packets from the cells, by what became of them.
 fn add_packet_rows(rows: &mut KeyValueTable, bus: &BusSummary, lost: u64) {
     let up = &bus.uplink;
@@ -44,6 +61,7 @@ fn add_packet_rows(rows: &mut KeyValueTable, bus: &BusSummary, lost: u64) {
         (up.backlog, "dropped by the kernel's backlog"),
         (up.outage, "lost with the bus"),
         (up.hosts, "lost between hosts"),
+        (up.queues, "refused by transmit queues"),
     ];
     add_unexplained_row(rows, "  lost", lost, reasons_text(&reasons, up.unknown), up.unknown);
     rows.add_row_unless_zero("  surplus", up.surplus, "more than the cells sent");

@@ -10,10 +10,13 @@ use rustix::io::Errno;
 use rustix::net::{AddressFamily, RecvFlags, SendFlags, SocketFlags, SocketType, sockopt};
 use socketcan::{CanFdSocket, SocketOptions};
 
-use super::{ClientHello, FilterPart, HELLO_VERSION, HelloReply, OWN_FRAME_BYTE_INDEX, decode_drop_notice};
+use super::{
+    ClientHello, FilterPart, HELLO_VERSION, HelloReply, OWN_FRAME_BYTE_INDEX, decode_drop_notice,
+    decode_refusal_notice, split_stamp,
+};
 use super::{default_directory, open_directory, socket_address};
 use crate::bus::batch::{self, Datagram};
-use crate::bus::carrier::BusBackend;
+use crate::bus::carrier::{BusBackend, OpenedSocket};
 use crate::bus::{Bus, BusError, BusOptions, Filter};
 
 /// Maximum time to wait for a server, which answers at once unless it is stopped.
@@ -27,7 +30,7 @@ const SEND_BUFFER_BYTES: usize = 1 << 18;
 pub(in crate::bus) struct EmbeddedBackend;
 
 impl BusBackend for EmbeddedBackend {
-    fn open(&self, name: &str, options: &BusOptions) -> Result<(CanFdSocket, usize), BusError> {
+    fn open(&self, name: &str, options: &BusOptions) -> Result<OpenedSocket, BusError> {
         let failed = |errno: Errno| BusError::open_error(name, "connect to", errno);
         let gone = |errno| match errno {
             // A busy client's hello comes after the server has turned the client away.
@@ -46,6 +49,8 @@ impl BusBackend for EmbeddedBackend {
             fd: options.fd,
             error_mask: options.error_mask,
             buffer: options.receive_buffer as u64,
+            version: HELLO_VERSION,
+            stamps: true,
         };
         rustix::net::send(&socket, &hello.encode(), SendFlags::NOSIGNAL).map_err(gone)?;
         let wait = Timespec::try_from(ANSWER_TIMEOUT).unwrap_or_default();
@@ -61,8 +66,9 @@ impl BusBackend for EmbeddedBackend {
             return Err(BusError::NoRoom(name.to_owned()));
         }
         match HelloReply::decode(bytes.get(..len).unwrap_or_default()) {
-            Some(HelloReply::Welcome { granted }) => {
-                Ok((socket, usize::try_from(granted).unwrap_or(usize::MAX)))
+            Some(HelloReply::Welcome { granted, stamps: is_timed, .. }) => {
+                let receive_buffer = usize::try_from(granted).unwrap_or(usize::MAX);
+                Ok(OpenedSocket { socket, receive_buffer, is_timed })
             }
             Some(HelloReply::Refused { version }) => {
                 Err(BusError::Refused { name: name.to_owned(), ours: HELLO_VERSION, theirs: version })
@@ -87,6 +93,14 @@ impl BusBackend for EmbeddedBackend {
 
     fn decode_drop_notice(&self, notice: &[u8]) -> Option<u32> {
         decode_drop_notice(notice)
+    }
+
+    fn split_stamp<'b>(&self, datagram: &'b [u8]) -> (&'b [u8], Option<u64>) {
+        split_stamp(datagram)
+    }
+
+    fn decode_refusal_notice(&self, notice: &[u8]) -> Option<u32> {
+        decode_refusal_notice(notice).map(|(total, _)| total)
     }
 
     fn bus_error(&self, errno: Errno) -> Option<fn(String) -> BusError> {

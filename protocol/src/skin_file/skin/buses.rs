@@ -2,7 +2,7 @@
 
 use std::collections::HashSet;
 
-use super::{JointKind, Robot, SkinBus, SkinReply, raw, sensing};
+use super::{BusTime, JointKind, Robot, SkinBus, SkinReply, raw, sensing};
 use crate::can::Format;
 use crate::document::{Checked, KeyPath};
 use crate::fixed::TorqueFormat;
@@ -36,10 +36,11 @@ pub(super) fn check_buses(raw: &[raw::RawBus], robot: &Robot) -> Checked<Vec<Ski
             .with_key("format")
             .parse_choice(&bus.format, &[("fd", Format::Fd), ("classic", Format::Classic)])?;
         let (bitrate, data_bitrate) = check_bit_rates(&at, bus, format)?;
+        let time = check_time(&at, bus)?;
         let chain = chain_index(&at, bus, robot)?;
         let torque_format = torque_format(&at, bus, robot, chain)?;
         let sensing = sensing::bus_sensing(&at, bus)?;
-        Ok(SkinBus { name, reply, format, chain, torque_format, bitrate, data_bitrate, sensing })
+        Ok(SkinBus { name, reply, format, chain, torque_format, bitrate, data_bitrate, sensing, time })
     };
     raw.iter().enumerate().map(bus).collect()
 }
@@ -85,6 +86,17 @@ fn check_reply(at: &KeyPath, bus: &raw::RawBus) -> Checked<SkinReply> {
         },
         (true, None, _) => Err(at.with_key("reply").fault("\"sum\"", "this reply needs the key slot_us too")),
     }
+}
+
+/// Checks whether frames take time on the bus, for which it must have a bit rate.
+fn check_time(at: &KeyPath, bus: &raw::RawBus) -> Checked<BusTime> {
+    let Some(time) = &bus.time else { return Ok(BusTime::None) };
+    let at = at.with_key("time");
+    let time = at.parse_choice(time, &[("none", BusTime::None), ("real", BusTime::Real)])?;
+    if time == BusTime::Real && bus.bitrate.is_none() {
+        return Err(at.fault("\"real\"", "this bus needs the key bitrate too"));
+    }
+    Ok(time)
 }
 
 /// Checks the nominal and data bit rates of a bus, which are optional and only needed for real hardware.

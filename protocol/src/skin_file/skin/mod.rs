@@ -18,6 +18,7 @@ mod robot;
 pub mod sensing;
 mod wires;
 
+use crate::wire_time::BitRates;
 use std::path::Path;
 
 use crate::can::Format;
@@ -116,6 +117,35 @@ pub struct SkinBus {
     pub data_bitrate: Option<u32>,
     /// The times at which the cells send measurements.
     pub sensing: Sensing,
+    /// Whether frames take time on an embedded bus.
+    pub time: BusTime,
+}
+
+/// The time that frames take on an embedded bus.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub enum BusTime {
+    /// None: frames are delivered at once.
+    #[default]
+    None,
+    /// That of a real bus with the bit rates of the skin, with arbitration.
+    Real,
+}
+
+impl SkinBus {
+    /// Returns the bit rates of the bus, by default 1 Mbit/s with data at 5 Mbit/s. A data bit rate that is not given is
+    /// the nominal one.
+    #[must_use]
+    #[expect(clippy::missing_panics_doc, reason = "the file was checked, and the default rates are allowed")]
+    pub fn rates_or_default(&self) -> BitRates {
+        let (nominal, data) = self
+            .bitrate
+            .map_or((1_000_000, 5_000_000), |nominal| (nominal, self.data_bitrate.unwrap_or(nominal)));
+        match self.format {
+            Format::Fd => BitRates::new(nominal, data),
+            Format::Classic => BitRates::classic(nominal),
+        }
+        .expect("the rates are in their ranges")
+    }
 }
 
 /// The controller that turns torques into motion.

@@ -137,6 +137,7 @@ pub(super) struct RawBus {
     pub(super) carry: Option<bool>,
     pub(super) bitrate: Option<i64>,
     pub(super) data_bitrate: Option<i64>,
+    pub(super) time: Option<String>,
     pub(super) sensing: Option<String>,
     pub(super) sensing_hz: Option<f64>,
 }
@@ -153,6 +154,7 @@ impl Default for RawBus {
             carry: None,
             bitrate: None,
             data_bitrate: None,
+            time: None,
             sensing: None,
             sensing_hz: None,
         }

@@ -5,7 +5,7 @@ use std::os::fd::OwnedFd;
 use std::time::Duration;
 
 use protocol::bus::batch::{is_memory_shortage, send_one};
-use protocol::bus::embedded::{ClientHello, HELLO_VERSION, HelloReply, MAX_HELLO_BYTES};
+use protocol::bus::embedded::{ClientHello, HelloReply, MAX_HELLO_BYTES, enable_time_stamps};
 use rustix::event::epoll::{self, EventData, EventFlags};
 use rustix::io::Errno;
 use rustix::net::{RecvFlags, Shutdown, SocketFlags, shutdown, sockopt};
@@ -80,6 +80,10 @@ impl Server {
             close_connection(&socket);
             return;
         }
+        // Without the time stamps of the kernel, a request has the time at which it is read.
+        if self.timed.is_some() {
+            let _ = enable_time_stamps(&socket);
+        }
         let mut client = Client::new(ClientId(index), socket);
         let is_alone = |other: &&mut Client| other.process == client.process && other.sibling.is_none();
         if client.process.is_some()
@@ -95,17 +99,21 @@ impl Server {
 
     /// Reads the first datagram of a client, its hello, and sets the filters in it.
     pub(super) fn receive_hello(&mut self, id: ClientId) {
+        let is_timed = self.timed.is_some();
         let Some(client) = self.client(id) else { return };
         let mut bytes = [0; MAX_HELLO_BYTES + 1];
-        let hello = match rustix::net::recv(&client.socket, &mut bytes, RecvFlags::DONTWAIT) {
+        let (hello, refused) = match rustix::net::recv(&client.socket, &mut bytes, RecvFlags::DONTWAIT) {
             Err(Errno::AGAIN | Errno::INTR) => return,
             Err(errno @ (Errno::NOMEM | Errno::NOBUFS)) => return self.handle_failure(id, errno),
             Ok((0, _)) | Err(_) => return self.remove_client(id),
-            Ok((len, _)) => ClientHello::decode(bytes.get(..len).unwrap_or_default()),
+            Ok((len, _)) => {
+                let bytes = bytes.get(..len).unwrap_or_default();
+                (ClientHello::decode(bytes), ClientHello::refused_version(bytes))
+            }
         };
         let Some(hello) = hello else {
             // The client may have closed its socket already, so an error is ignored.
-            let _ = send_one(&client.socket, &HelloReply::Refused { version: HELLO_VERSION }.encode());
+            let _ = send_one(&client.socket, &HelloReply::Refused { version: refused }.encode());
             self.post.totals.refused += 1;
             return self.remove_client(id);
         };
@@ -118,7 +126,9 @@ impl Server {
         let granted = sockopt::socket_send_buffer_size(&client.socket).unwrap_or(0) as u64;
         client.greeted = true;
         client.fd = hello.fd;
-        if send_welcome(&client.socket, granted).is_err() {
+        client.stamps = hello.stamps && is_timed;
+        let welcome = HelloReply::Welcome { granted, version: hello.version, stamps: client.stamps };
+        if send_welcome(&client.socket, welcome).is_err() {
             return self.remove_client(id);
         }
         self.post.totals.clients += 1;
@@ -135,8 +145,8 @@ fn close_connection(socket: &OwnedFd) -> bool {
 
 /// Sends the answer to a client's hello. As the first datagram in the socket it always finds room, so only a lack of
 /// memory can prevent it.
-fn send_welcome(socket: &OwnedFd, granted: u64) -> io::Result<usize> {
-    let answer = HelloReply::Welcome { granted }.encode();
+fn send_welcome(socket: &OwnedFd, welcome: HelloReply) -> io::Result<usize> {
+    let answer = welcome.encode();
     let mut tries = 0..10;
     loop {
         match send_one(socket, &answer) {

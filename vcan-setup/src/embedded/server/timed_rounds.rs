@@ -1,0 +1,100 @@
+//! The rounds of a timed bus: in each, the server reads all requests, advances the bus to the present, and sends the
+//! frames that have ended.
+
+use std::os::fd::OwnedFd;
+use std::time::Duration;
+
+use protocol::bus::batch::Datagram;
+use rustix::net::RecvFlags;
+
+use super::{ReportSink, Server, TimedRounds};
+use crate::embedded::parcel::FrameDatagram;
+use crate::embedded::routing::ClientId;
+use crate::embedded::timed::{BusClock, RoundEffects, TimedBus, TimedBusOptions};
+
+/// The sender of frames whose client has disconnected. No client has this number.
+const NOBODY: ClientId = ClientId(usize::MAX);
+
+impl Server {
+    /// Lets frames take time on the bus.
+    ///
+    /// # Errors
+    /// Returns the reason if the bit-error rate is out of range.
+    pub fn with_time(mut self, options: TimedBusOptions) -> Result<Self, bus_model::BitErrorsError> {
+        self.timed = Some(Box::new(TimedRounds {
+            bus: TimedBus::new(options)?,
+            clock: BusClock::start(),
+            wall_offset: 0,
+            effects: RoundEffects::default(),
+        }));
+        Ok(self)
+    }
+
+    /// Returns the time until a round must end; `None` if no frame waits.
+    pub(super) fn time_to_round_end(&self) -> Option<Duration> {
+        let timed = self.timed.as_ref()?;
+        Some(Duration::from_nanos(timed.bus.wake_time()?.saturating_sub(timed.clock.now())))
+    }
+
+    pub(super) fn begin_timed_round(&mut self) {
+        if let Some(timed) = &mut self.timed {
+            timed.wall_offset = timed.clock.wall_offset();
+        }
+    }
+
+    /// Advances a timed bus to the present, and queues what it has sent for the clients.
+    pub(super) fn end_timed_round(&mut self) {
+        let Some(timed) = &mut self.timed else { return };
+        let mut effects = std::mem::take(&mut timed.effects);
+        effects.deliveries.clear();
+        effects.refusals.clear();
+        timed.bus.end_round(timed.clock.now(), &mut effects);
+        for delivery in &effects.deliveries {
+            self.route(delivery.from.unwrap_or(NOBODY), delivery.parcel, Some(delivery.stamp));
+        }
+        for refusal in &effects.refusals {
+            let is_dirty = self.client(refusal.from).is_some_and(|it| it.enqueue_refusal(refusal.raw_id));
+            if is_dirty {
+                self.dirty.push_back(refusal.from);
+            }
+        }
+        if let Some(timed) = &mut self.timed {
+            timed.effects = effects;
+        }
+    }
+
+    /// Notes that the frames of a round were sent to all clients.
+    pub(super) fn note_delivered(&mut self) {
+        if let Some(timed) = &mut self.timed
+            && !timed.effects.deliveries.is_empty()
+        {
+            timed.bus.note_delivered(timed.clock.now(), &timed.effects.deliveries);
+        }
+    }
+
+    /// Reports the figures of a timed bus once for each byte that has arrived.
+    pub(super) fn answer_report_requests(&mut self, reports: &mut Option<(&OwnedFd, ReportSink<'_>)>) {
+        let Some((requests, report)) = reports else { return };
+        let mut bytes = [0; 16];
+        match rustix::net::recv(*requests, &mut bytes, RecvFlags::DONTWAIT) {
+            Ok((count @ 1.., _)) => {
+                let figures = self.timed.as_mut().map(|timed| timed.bus.report()).unwrap_or_default();
+                (0..count).for_each(|_| report(&figures));
+            }
+            Ok((0, _)) => {
+                // The other end is closed, which would be reported without end.
+                let _ = rustix::event::epoll::delete(&self.post.epoll, *requests);
+                *reports = None;
+            }
+            Err(_) => {}
+        }
+    }
+}
+
+impl TimedRounds {
+    /// Collects a frame of a client, with the time at which the client sent it.
+    pub(super) fn collect(&mut self, from: ClientId, parcel: FrameDatagram, datagram: Datagram<'_>) {
+        let sent = datagram.info().at_nanos.map(|at| at.wrapping_add_signed(self.wall_offset));
+        self.bus.collect(sent.unwrap_or_else(|| self.clock.now()), from, parcel);
+    }
+}
