@@ -53,7 +53,7 @@ mod slot;
 pub use error::{BusError, SendError};
 pub use filter::Filter;
 pub use inbox::{Inbox, ReceivedFrame};
-pub use kernel::{GATEWAY_RECEIVE_BUFFER_BYTES, has_socketcan, set_receive_buffer};
+pub use kernel::{GATEWAY_RECEIVE_BUFFER_BYTES, has_socketcan, set_batch_scheduling, set_receive_buffer};
 pub use kinds::{BusKind, KindChoice, KindChoices, KindOption, KindsError, UnknownKind};
 
 /// Options for opening a bus.
@@ -90,15 +90,6 @@ impl Default for BusOptions {
             directory: None,
         }
     }
-}
-
-/// Sets the policy `SCHED_BATCH` for this thread and its future children, so that they do not preempt a
-/// running process when they wake up. Returns true if the system granted it.
-///
-/// The processes of a bench wake each other hundreds of times a second: the cells, and the server of their bus. Without
-/// this policy, every cell that receives a frame preempts the server, at the cost of a context switch per frame.
-pub fn set_batch_scheduling() -> bool {
-    calls::set_sched_batch()
 }
 
 /// An open bus.

@@ -10,8 +10,8 @@ use rustix::io::Errno;
 use rustix::net::SendFlags;
 
 use super::calls;
-use super::embedded::{MAX_FRAME_DATAGRAM_BYTES, STAMP_BYTES};
 use super::slot::DatagramBuffer;
+use super::slot::{MAX_FRAME_DATAGRAM_BYTES, STAMP_BYTES};
 use crate::can::FD_BYTES;
 
 pub use super::slot::DatagramInfo;

@@ -10,8 +10,9 @@ use std::os::fd::{AsFd, OwnedFd};
 use socketcan::{CanFdSocket, SocketOptions};
 
 use super::{Filter, calls};
-use crate::can::{CLASSIC_BYTES, FD_BYTES};
+use crate::can::CLASSIC_BYTES;
 
+pub use super::slot::{MAX_FRAME_DATAGRAM_BYTES, STAMP_BYTES};
 pub use client::seqpacket_socket;
 pub(super) use client::{EmbeddedBackend, closed_error};
 pub use directory::{
@@ -26,10 +27,6 @@ mod directory;
 pub const HELLO_VERSION: u8 = 3;
 /// The oldest version that a server understands. It has no time stamps of the bus.
 pub const OLDEST_HELLO_VERSION: u8 = 2;
-/// Length in bytes of the time stamp that follows a frame on a timed bus.
-pub const STAMP_BYTES: usize = 8;
-/// Maximum length of a datagram with a frame in bytes.
-pub const MAX_FRAME_DATAGRAM_BYTES: usize = FD_BYTES + STAMP_BYTES;
 /// Index of the byte in a frame that is 1 if the receiving client sent the frame itself.
 pub const OWN_FRAME_BYTE_INDEX: usize = 6;
 /// Maximum length of a client's hello in bytes.
@@ -330,6 +327,7 @@ pub const fn decode_drop_notice(bytes: &[u8]) -> Option<u32> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::can::FD_BYTES;
     use proptest::prelude::*;
 
     fn any_hello() -> impl Strategy<Value = ClientHello> {

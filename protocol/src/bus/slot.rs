@@ -1,6 +1,11 @@
 //! The buffer of one datagram, and the kernel's control messages about it.
 
-use super::embedded::MAX_FRAME_DATAGRAM_BYTES;
+use crate::can::FD_BYTES;
+
+/// Length in bytes of the time stamp that follows a frame on a timed bus.
+pub const STAMP_BYTES: usize = 8;
+/// Maximum length of a datagram with a frame in bytes.
+pub const MAX_FRAME_DATAGRAM_BYTES: usize = FD_BYTES + STAMP_BYTES;
 
 /// The buffer of one datagram and its control messages.
 pub(super) struct DatagramBuffer {

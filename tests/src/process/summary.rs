@@ -61,8 +61,17 @@ impl Summary {
         let buses = self.0["buses"].as_array().unwrap().len();
         for bus in 0..buses {
             let of = |pointer: &str| self.number(&format!("/buses/{bus}{pointer}"));
-            let reasons =
-                ["in_time", "late", "too_late", "skipped", "not_heard", "lost", "in_doubt", "unknown"];
+            let reasons = [
+                "in_time",
+                "late",
+                "too_late",
+                "skipped",
+                "not_heard",
+                "lost",
+                "refused",
+                "in_doubt",
+                "unknown",
+            ];
             let replies: u64 = reasons.map(|reason| of(&format!("/replies/{reason}"))).iter().sum();
             assert_eq!(replies, of("/replies/due"), "{:#}", self.0);
             let cells = || self.cells().iter().filter(|cell| cell["bus"] == self.0["buses"][bus]["name"]);
@@ -74,7 +83,7 @@ impl Summary {
             let missing: u64 = missing.map(|count| count.as_u64().unwrap()).sum();
             assert_eq!(missing, replies - of("/replies/in_time") - of("/replies/late"), "{:#}", self.0);
             let arrived = of("/uplink/delivered") + of("/uplink/rejected") + of("/uplink/unheard");
-            let reasons = ["dropped", "backlog", "outage", "hosts", "unknown"];
+            let reasons = ["dropped", "backlog", "outage", "hosts", "queues", "unknown"];
             let lost: u64 = reasons.map(|reason| of(&format!("/uplink/{reason}"))).iter().sum();
             assert_eq!(of("/uplink/sent") + of("/uplink/surplus"), arrived + lost, "{:#}", self.0);
             assert_eq!((of("/replies/unknown"), of("/uplink/unknown")), (0, 0), "{:#}", self.0);

@@ -32,6 +32,7 @@ mod process_run;
 mod process_sensing;
 mod process_slcan;
 mod process_sums;
+mod process_timed;
 mod process_view;
 mod process_view_bench;
 mod process_view_recording;

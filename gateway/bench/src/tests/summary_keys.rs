@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use crate::summary::{
     BusSummary, CellError, CellSummary, ErrorCells, HaltSummary, HostSummary, LoopSummary, NetworkSummary,
     Outcome, PrivateMemory, ProcessorUse, RecordingAccount, RepliesSummary, Summary, SumsSummary,
-    TickSummary, Verdict, WrittenFile,
+    TickSummary, TimedReport, Verdict, WrittenFile,
 };
 use model::quantiles::{Quantiles, histogram};
 use model::table::{BusTable, CellStatus, FrameEvent, TorqueAccuracy};
@@ -191,6 +191,11 @@ fn every_key_is_documented_with_its_type_and_no_other() {
     let bus = BusSummary {
         hosts: vec![HostSummary { name: "cells".to_owned(), ..HostSummary::default() }],
         sums: Some(SumsSummary::default()),
+        timed: Some(TimedReport {
+            load: Some(0.5),
+            record_failure: Some("cannot write record.txt".to_owned()),
+            ..TimedReport::default()
+        }),
         network: Some(NetworkSummary {
             differences: vec!["cell 2 does not speak".to_owned()],
             unreachable: vec![2],

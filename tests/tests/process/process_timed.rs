@@ -1,0 +1,190 @@
+//! Embedded buses on which frames take time, with real servers, cells and clients.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+
+use bus_model::TransmitQueue;
+use protocol::bus::embedded::{ClientHello, HelloReply, seqpacket_socket, socket_address};
+use protocol::bus::{Bus, BusKind, BusOptions, Filter, Inbox, KindChoice};
+use protocol::can::{BIT_RATE_SWITCH, Frame};
+use protocol::wire_time::{BitRates, FrameBits};
+use rustix::net::{RecvFlags, SendFlags, SocketFlags};
+use rustix::process::Signal;
+use skinbus_tests::process::{PRESSED, Running, TestDir, skin, until};
+
+const RATES: &str = "1M/5M";
+
+fn serve(place: &TestDir, options: &str) -> Running {
+    let server = place.start("vcan-setup", &format!("serve vcan0 {options}"));
+    server.wait_for_stdout("serving vcan0 at ");
+    server
+}
+
+fn open(place: &TestDir) -> Bus {
+    let directory = Some(place.buses());
+    let options = BusOptions { filters: vec![Filter::ALL], directory, ..BusOptions::default() };
+    Bus::open("vcan0", KindChoice::Only(BusKind::Embedded), &options).unwrap()
+}
+
+fn frame(id: u32, data: &[u8]) -> Frame {
+    Frame::fd(id, BIT_RATE_SWITCH, data).unwrap()
+}
+
+fn nanos(frame: &Frame) -> u64 {
+    FrameBits::from_frame(frame).unwrap().nanoseconds(RATES.parse::<BitRates>().unwrap())
+}
+
+#[test]
+fn frames_are_stamped_with_their_ends_and_refused_when_the_queue_is_full() {
+    let place = TestDir::new();
+    let server = serve(&place, &format!("--rates {RATES} --queue fifo:3 --record record.txt"));
+    let (sender, listener) = (open(&place), open(&place));
+    assert!(sender.is_timed() && listener.is_timed());
+    // A program of version 2 gets the same frames without stamps.
+    let older = seqpacket_socket(SocketFlags::empty()).unwrap();
+    rustix::net::connect(&older, &socket_address(&place.buses(), "vcan0").unwrap()).unwrap();
+    let hello =
+        ClientHello { filters: vec![Filter::ALL], buffer: 1 << 20, version: 2, ..ClientHello::default() };
+    rustix::net::send(&older, &hello.encode(), SendFlags::empty()).unwrap();
+    let mut bytes = [0; 128];
+    let (len, _) = rustix::net::recv(&older, &mut bytes, RecvFlags::empty()).unwrap();
+    let answer = HelloReply::decode(&bytes[..len]);
+    assert!(matches!(answer, Some(HelloReply::Welcome { version: 2, stamps: false, .. })), "{answer:?}");
+
+    // The frames of one call are requested within a few microseconds, much faster than the bus sends them.
+    let sent: Vec<_> = (0..8).map(|id| frame(0x100 + id, &[0xAA; 64])).collect();
+    sender.send(&sent).unwrap();
+    let mut inbox = Inbox::new();
+    let mut last = Some(frame(0x7FF, &[]));
+    until("the last frame", || {
+        sender.receive(&mut inbox).unwrap();
+        // The other program has a queue of its own, which is empty.
+        if inbox.refused_count() > 0
+            && let Some(last) = last.take()
+        {
+            listener.send(&[last]).unwrap();
+        }
+        inbox.frames().any(|received| received.frame.id() == 0x7FF).then_some(())
+    });
+    server.signal(Signal::TERM);
+    let ended = server.end();
+    assert_eq!(ended.code(), Some(0));
+    let record = place.read("record.txt");
+    let lines: Vec<Vec<&str>> = record.lines().skip(1).map(|line| line.split(' ').collect()).collect();
+    let refused = lines.iter().filter(|line| line[0] == "X").count();
+    assert!(refused > 0 && refused < 8, "{record}");
+    let ends: Vec<u64> = lines.iter().filter(|it| it[0] == "S").map(|it| it[3].parse().unwrap()).collect();
+    let starts: Vec<u64> = lines.iter().filter(|it| it[0] == "S").map(|it| it[2].parse().unwrap()).collect();
+    assert_eq!(
+        record.lines().next().unwrap(),
+        "# skinbus timed bus 1 rates 1M/5M queue fifo:3 errors 0 seed 1"
+    );
+    for (start, end) in starts.iter().skip(1).zip(&ends) {
+        assert!(start >= end, "{record}");
+    }
+    for (line, (start, end)) in
+        lines.iter().filter(|line| line[0] == "Q").zip(starts.iter().zip(&ends)).take(8 - refused)
+    {
+        let frame = protocol::candump::parse_frame(line[4]).unwrap();
+        assert_eq!(end - start, nanos(&frame), "{record}");
+    }
+    let mut older_frames = 0;
+    while let Ok((len @ 1.., _)) = rustix::net::recv(&older, &mut bytes, RecvFlags::DONTWAIT) {
+        assert!([16, 72].contains(&len), "no stamps, no notices: {len}");
+        older_frames += 1;
+    }
+    assert_eq!(older_frames, ends.len());
+    // The listener has sent the last frame and received all others, with the stamps of the record.
+    let mut stamped = Vec::new();
+    while listener.receive(&mut inbox).is_ok_and(|count| count > 0) {
+        stamped.extend(inbox.frames().map(|received| received.at_nanos));
+    }
+    assert!(!stamped.is_empty() && stamped.iter().all(|stamp| ends.contains(stamp)), "{stamped:?} {ends:?}");
+    place.is_left_clean();
+}
+
+#[test]
+fn a_run_on_a_timed_bus_accounts_for_each_reply() {
+    let place = TestDir::new();
+    place.write(
+        "skin.toml",
+        &skin(6).replace(
+            "format = \"fd\"",
+            "format = \"fd\"\nbitrate = 1000000\ndata_bitrate = 5000000\ntime = \"real\"",
+        ),
+    );
+    place.scenario(PRESSED);
+    place.bench(2.0, "").end().succeeded();
+    let summary = place.summary();
+    summary.adds_up();
+    let timed = &summary.0["buses"][0]["timed"];
+    assert_eq!(
+        (&timed["rates"], &timed["queue"]),
+        (&"1M/5M".into(), &TransmitQueue::default().to_string().into())
+    );
+    assert_eq!(timed["sent"], timed["requested"], "{timed}");
+    assert_eq!((timed["refused"].as_u64(), timed["waiting"].as_u64()), (Some(0), Some(0)), "{timed}");
+    assert!(timed["beside"].as_u64() > Some(0) && timed["load"].as_f64() > Some(0.0), "{timed}");
+    // The option goes before the skin.
+    place.bench(1.0, "--bus-time none").end().succeeded();
+    assert!(place.summary().0["buses"][0]["timed"].is_null());
+    place.is_left_clean();
+}
+
+#[test]
+fn on_a_full_bus_nothing_is_missing_without_a_reason() {
+    let place = TestDir::new();
+    // Six cells whose replies alone would take the bus more than its time.
+    place.write(
+        "skin.toml",
+        &(skin(6).replace("format = \"fd\"", "format = \"fd\"\nbitrate = 50000")
+            + "\n[safety]\nbad_cycles = 10000\n"),
+    );
+    place.scenario(&PRESSED.replace("[3]", "[1, 2, 3, 4, 5, 6]"));
+    let ended = place.bench(6.0, "--bus-time real:priority:4").end();
+    let summary = place.summary();
+    summary.adds_up();
+    let timed = &summary.0["buses"][0]["timed"];
+    assert!(timed["load"].as_f64() > Some(0.9), "{timed}\n{}", ended.stderr);
+    assert!(timed["refused"].as_u64() > Some(0), "{timed}");
+    let replies = &summary.0["buses"][0]["replies"];
+    assert!(replies["in_time"].as_u64() < replies["due"].as_u64(), "{replies}");
+    place.is_left_clean();
+}
+
+#[test]
+fn what_cannot_take_time_is_refused() {
+    let place = TestDir::new();
+    place.pressed();
+    let refused = |words: &str, code: i32, why: &str| {
+        let ended = place.start("vcan-setup", words).end();
+        assert!(ended.refusal(code).contains(why), "{words}: {}", ended.stderr);
+    };
+    refused("serve vcan0 --queue fifo", 2, "--rates");
+    refused("serve vcan0 --rates 1M/5M --queue lifo", 2, "use fifo or priority");
+    refused("serve vcan0 --rates 1M/5M --bit-errors 0.5", 2, "bit error rate 0.5: use 0 to 0.01");
+    refused("serve vcan0 --rates 9M", 2, "9M");
+    place.write("record.txt", "mine");
+    refused("serve vcan0 --rates 1M --record record.txt", 1, "cannot create record.txt");
+    assert_eq!(place.read("record.txt"), "mine");
+
+    let server = serve(&place, "");
+    let ended = place.bench(1.0, "--bus-time real").end();
+    let why = "vcan0 is served by another program without bit rates: end it, or start it as `vcan-setup serve vcan0 \
+               --rates 1M/5M`, or add --bus-time none";
+    assert!(ended.refusal(2).contains(why), "{}", ended.stderr);
+    server.signal(Signal::TERM);
+    server.end().succeeded();
+
+    let server = serve(&place, "--rates 1M/5M");
+    let ended = place.start("vcan-setup", "slcan vcan0 /dev/null --bus-kind embedded").end();
+    assert!(ended.stderr.contains("frames take time on the embedded bus vcan0"), "{}", ended.stderr);
+    server.signal(Signal::TERM);
+    server.end().succeeded();
+    place.write("skin.toml", &skin(2).replace("format = \"fd\"", "format = \"fd\"\ntime = \"real\""));
+    let ended = place.bench(1.0, "").end();
+    assert!(
+        ended.refusal(2).contains("bus[0].time = \"real\": this bus needs the key bitrate too"),
+        "{}",
+        ended.stderr
+    );
+    place.is_left_clean();
+}
