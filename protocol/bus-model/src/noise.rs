@@ -15,7 +15,7 @@ const FD_TAIL_BITS: u32 = 12;
 
 /// The error for a bit-error rate that is not a number, negative, or above [`BitErrors::MAX_RATE`].
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
-#[error("bit error rate {got}: use 0 to {}", BitErrors::MAX_RATE)]
+#[error("the bit error rate {got} is out of range: use 0 to {}", BitErrors::MAX_RATE)]
 pub struct BitErrorsError {
     /// The rejected rate.
     pub got: f64,
@@ -126,6 +126,6 @@ mod tests {
             assert!(BitErrors::new(got, 0).is_err(), "{got}");
         }
         let error = BitErrors::new(0.5, 0).unwrap_err();
-        assert_eq!(error.to_string(), "bit error rate 0.5: use 0 to 0.01");
+        assert_eq!(error.to_string(), "the bit error rate 0.5 is out of range: use 0 to 0.01");
     }
 }

@@ -21,7 +21,7 @@ pub enum BusError {
     Name(String),
     /// There are more filters than the kernel accepts.
     #[error(
-        "{got} filters are too many for one socket on {name}: use at most {max}",
+        "{got} filters are too many for a socket on {name}: use at most {max}",
         max = Filter::MAX_COUNT
     )]
     Filters {
@@ -44,8 +44,9 @@ pub enum BusError {
     NotCan(String),
     /// CAN FD was requested on an interface for classic CAN.
     #[error(
-        "{name} has MTU {mtu} and CAN FD needs 72: set it with `ip link set {name} down && ip link set \
-         {name} mtu 72 up`, or use the classic format (CAN hardware: `vcan-setup doctor SKIN.toml` shows how)"
+        "{name} has MTU {mtu}, but CAN FD needs 72: set it with `ip link set {name} down && ip link set \
+         {name} mtu 72 up`, or use the classic format (CAN hardware: `vcan-setup doctor SKIN.toml` shows \
+         how)"
     )]
     ClassicOnly {
         /// The interface.
@@ -62,7 +63,7 @@ pub enum BusError {
     #[error("{0} was removed while it was in use: create it again, then open it again")]
     Gone(String),
     /// The process lacks permission.
-    #[error("not allowed to {doing} {name}: {source}")]
+    #[error("this program is not allowed to {doing} {name}: {source}")]
     Permission {
         /// The bus.
         name: String,
@@ -112,7 +113,8 @@ pub enum BusError {
     },
     /// The embedded bus did not answer in time.
     #[error(
-        "the embedded bus {name} did not answer within {} ms: is its server stopped, or out of file descriptors (`ulimit -n`)?",
+        "the embedded bus {name} did not answer within {} ms: check that its server runs and has file \
+         descriptors left (`ulimit -n`)",
         waited.as_millis()
     )]
     NoAnswer {

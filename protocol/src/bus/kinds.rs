@@ -132,7 +132,7 @@ impl fmt::Display for KindChoice {
 
 /// The error for a word that does not name a kind of bus.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
-#[error("{got:?} is not a kind of bus: use auto, {}", BusKind::names())]
+#[error("{got:?} is not a bus kind: use auto, {}", BusKind::names())]
 pub struct UnknownKind {
     /// The rejected word.
     pub got: String,
@@ -271,7 +271,7 @@ mod tests {
             assert_eq!(word.parse::<KindChoice>().unwrap().to_string(), word);
         }
         let error = "vcan".parse::<KindChoice>().unwrap_err().to_string();
-        assert_eq!(error, "\"vcan\" is not a kind of bus: use auto, socketcan or embedded");
+        assert_eq!(error, "\"vcan\" is not a bus kind: use auto, socketcan or embedded");
     }
 
     #[test]
@@ -306,7 +306,7 @@ mod tests {
                 word.parse::<KindOption>()
                     .unwrap_err()
                     .to_string()
-                    .starts_with(&format!("{word:?} is not a kind"))
+                    .starts_with(&format!("{word:?} is not a bus kind"))
             );
         }
     }

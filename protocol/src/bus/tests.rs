@@ -55,7 +55,7 @@ fn a_kernel_without_can_says_so_and_one_with_it_names_the_missing_interface() {
 fn too_many_filters_are_refused_before_anything_is_opened() {
     let options = BusOptions { filters: vec![Filter::ALL; 513], ..BusOptions::default() };
     let error = Bus::open("vcan0", KindChoice::Auto, &options).unwrap_err();
-    assert_eq!(error.to_string(), "513 filters are too many for one socket on vcan0: use at most 512");
+    assert_eq!(error.to_string(), "513 filters are too many for a socket on vcan0: use at most 512");
 }
 
 /// Returns an embedded bus without a server, and the server's end of its connection.

@@ -21,7 +21,7 @@ fn claim_descriptor(descriptor: u32) -> io::Result<()> {
     let mut taken = OPENED_DESCRIPTORS.lock().unwrap_or_else(PoisonError::into_inner);
     if taken.contains(&descriptor) {
         return Err(io::Error::other(
-            "it can be read only once, but two arguments name it: use a file for one of them",
+            "two arguments name this input, but it can be read only once: use a file for one of them",
         ));
     }
     taken.push(descriptor);
@@ -145,7 +145,10 @@ mod tests {
         let (reader, mut writer) = io::pipe().unwrap();
         let name = format!("/dev/fd/{}", reader.as_raw_fd());
         let mut file = open(Path::new(&name)).unwrap();
-        assert!(error(Path::new(&name)).starts_with("it can be read only once, but two arguments name it"));
+        assert!(
+            error(Path::new(&name))
+                .starts_with("two arguments name this input, but it can be read only once")
+        );
         let writing = std::thread::spawn(move || {
             std::thread::sleep(std::time::Duration::from_millis(20));
             io::Write::write_all(&mut writer, b"late")

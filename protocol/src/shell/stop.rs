@@ -51,7 +51,7 @@ impl<F: AsFd> InterruptibleWriter<F> {
             match poll(&mut [PollFd::new(&self.file, PollFlags::OUT)], timeout.as_ref()) {
                 Ok(0) if stop_flag().load(Ordering::Relaxed) => {
                     if self.polls_left == 0 {
-                        let why = "the program that should read it does not read";
+                        let why = "the program at the other end does not read it";
                         return Err(io::Error::new(io::ErrorKind::TimedOut, why));
                     }
                     self.polls_left -= 1;

@@ -156,7 +156,7 @@ impl KeyPath {
 pub type RoundingFn<const F: u32> = fn(f64) -> Result<Q<F>, OutOfRange>;
 
 impl fmt::Display for DocumentFault {
-    /// Formats the fault like `cell[3].joint = 9: the robot has joints 1 to 6`.
+    /// Formats the fault like `cell[3].joint = 9: use a joint from 1 to 6`.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for (index, step) in self.path.iter().enumerate() {
             match step {

@@ -196,7 +196,7 @@ fn filters_change_in_order_with_the_frames() {
     assert_eq!(read_all(&client), expected);
 
     let error = client.set_filters(&vec![Filter::ALL; 513]).unwrap_err().to_string();
-    assert_eq!(error, "513 filters are too many for one socket on vcan0: use at most 512");
+    assert_eq!(error, "513 filters are too many for a socket on vcan0: use at most 512");
     client.set_filters(&vec![exact(END_MARKER_ID); 512]).unwrap();
     wait_until_routed(&bench);
     other.send(&[frame(1, 5), frame(END_MARKER_ID, 0)]).unwrap();
@@ -433,7 +433,8 @@ fn a_server_that_lets_nobody_in_is_given_up_on() {
         &BusOptions { directory, ..BusOptions::default() },
     );
     let error = error.unwrap_err().to_string();
-    let expected = "the embedded bus vcan0 did not answer within 2000 ms: is its server stopped, or out of file descriptors (`ulimit -n`)?";
+    let expected = "the embedded bus vcan0 did not answer within 2000 ms: check that its server runs and has \
+                    file descriptors left (`ulimit -n`)";
     assert_eq!(error, expected);
     drop(server);
 }

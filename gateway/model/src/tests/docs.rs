@@ -81,7 +81,7 @@ fn the_examples_are_read_and_mean_what_the_text_says() {
     assert_eq!((touch.cells.len(), touch.at + touch.length), (2, Micros(2_500_000)), "gone at 2.5 s");
     let nowhere = skin_text().replacen("joint = 2", "joint = 9", 1);
     let said = read_skin(&nowhere);
-    assert!(said.ends_with(": cell[0].joint = 9: the robot has joints 1 to 6"), "{said}");
+    assert!(said.ends_with(": cell[0].joint = 9: use a joint from 1 to 6"), "{said}");
 }
 
 #[test]

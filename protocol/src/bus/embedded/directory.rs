@@ -44,7 +44,7 @@ pub fn socket_address(directory: &Path, bus: &str) -> Result<SocketAddrUnix, Dir
 #[non_exhaustive]
 pub enum DirectoryError {
     /// The directory belongs to another user, who could replace its sockets.
-    #[error("{} belongs to user {owner}, but this program runs as user {us}: set SKINBUS_DIR to a directory of your own", path.display())]
+    #[error("the directory {} for embedded buses belongs to user {owner}, but this program runs as user {us}: set SKINBUS_DIR to a directory of your own", path.display())]
     Owner {
         /// The directory.
         path: PathBuf,
@@ -54,7 +54,7 @@ pub enum DirectoryError {
         us: u32,
     },
     /// Other users have access to the directory.
-    #[error("{} has mode {mode:04o}, but the bus must be private: `chmod 700` it, or set SKINBUS_DIR to another directory", path.display())]
+    #[error("the directory {} for embedded buses has mode {mode:04o}, so other users can open it: run `chmod 700` on it, or set SKINBUS_DIR to another directory", path.display())]
     Mode {
         /// The directory.
         path: PathBuf,
@@ -63,13 +63,13 @@ pub enum DirectoryError {
     },
     /// The path of the bus's socket is longer than a socket address allows.
     #[error(
-        "{} is too long for a socket, whose path can have at most 107 bytes: set SKINBUS_DIR to a shorter \
+        "the path {} is too long for a Unix socket, which allows 107 bytes: set SKINBUS_DIR to a shorter \
          path",
         .0.display()
     )]
     TooLong(PathBuf),
     /// The directory cannot be opened or created. Symbolic links are not followed.
-    #[error("cannot use {} as the directory of embedded buses: {source}; set SKINBUS_DIR to a directory of your own", path.display())]
+    #[error("cannot use the directory {} for embedded buses: {source}; set SKINBUS_DIR to a directory of your own", path.display())]
     Io {
         /// The directory.
         path: PathBuf,

@@ -110,8 +110,8 @@ fn check_cell(
     if reach >= MAX_REACH {
         let [x, y, z] = raw.position;
         let why = format!(
-            "node {node} can be {reach:.3} m away from a frame of its rows, {:.3} m more than the \
-             {MAX_REACH} m that fit into Q1.14",
+            "the distance from node {node} to a joint frame of its chain can reach {reach:.3} m, {:.3} m \
+             more than Q1.14 can hold ({MAX_REACH} m)",
             reach - MAX_REACH
         );
         return Err(at.with_key("position").fault(format_args!("[{x}, {y}, {z}]"), why));
@@ -182,18 +182,25 @@ fn joint_and_row(at: &KeyPath, raw: &raw::RawCell, robot: &Robot, chain: usize) 
         let number = u8::try_from(got).ok().filter(|&it| it > 0 && usize::from(it) <= max);
         number.ok_or_else(|| at.with_key(key).fault(got, format_args!("{what} 1 to {max}")))
     };
-    let joint = raw.joint.map(|got| within("joint", got, joints, "the robot has joints")).transpose()?;
-    let row = raw.row.map(|got| within("row", got, rows, "the chain has rows")).transpose()?;
+    let joint = raw.joint.map(|got| within("joint", got, joints, "use a joint from")).transpose()?;
+    let row = raw.row.map(|got| within("row", got, rows, "use a row from")).transpose()?;
     match (joint, row) {
         (None, None) => Err(at
             .with_key("joint")
             .fault("", format_args!("must name the joint that moves the cell: 1 to {joints}"))),
         (Some(joint), None) => Ok((joint, chain.row_of(joint).unwrap_or_default())),
         (given, Some(row)) => match chain.joint_of_row(row) {
-            0 => Err(at.with_key("row").fault(row, "no joint moves this row")),
+            0 => Err(at.with_key("row").fault(
+                row,
+                "no joint moves this row: choose the row of a joint, or a \
+                                                    row after it",
+            )),
             joint if given.is_none_or(|given| given == joint) => Ok((joint, row)),
             joint => {
-                let why = format!("joint {joint} moves this row: correct the key joint, or leave it out");
+                let why = format!(
+                    "this row is moved by joint {joint}, not by the joint given: correct the \
+                                   key joint, or leave it out"
+                );
                 Err(at.with_key("row").fault(row, why))
             }
         },

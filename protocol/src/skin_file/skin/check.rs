@@ -83,12 +83,12 @@ fn check_sum_tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Ch
         let node = skin.cells.get(first).map_or(0, |cell| cell.node.get());
         let others = match skin.cells.iter().filter(|cell| is_truncated(cell)).count() - 1 {
             0 => String::new(),
-            1 => " (nor to another cell)".to_owned(),
-            count => format!(" (nor to {count} other cells)"),
+            1 => " (and none to 1 other cell)".to_owned(),
+            count => format!(" (and none to {count} other cells)"),
         };
         let why = format!(
-            "no wires lead from a root of its bus to this cell{others}, but sums need them: name neighbors at both ends, or \
-             set root = true"
+            "no path of wires leads from a root of its bus to this cell{others}, but sums need one: name the \
+             neighbors at both ends of each wire, or set root = true for a cell"
         );
         return Err(KeyPath::top_level_key("cell").with_index(first).with_key("node").fault(node, why));
     }
@@ -169,7 +169,7 @@ fn check_controller(raw: raw::RawController, joints: usize) -> Checked<Controlle
         };
     let max_speed = match (raw.max_speed, raw.max_speed_rad_s) {
         (Some(_), Some(_)) => {
-            let why = "this is the former name of max_speed: give only one of them";
+            let why = "this is the old name of the key max_speed: give only one of the two";
             return Err(at.with_key("max_speed_rad_s").fault("", why));
         }
         (None, Some(former)) => each_positive("max_speed_rad_s", former)?,

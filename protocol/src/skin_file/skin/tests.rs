@@ -106,10 +106,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
         says("node = 2", "node = 255"),
         "skin.toml:40: cell[1].node = 255: must be 1 to 254; further cells need another bus"
     );
-    assert_eq!(
-        says("joint = 1", "joint = 3"),
-        "skin.toml:41: cell[1].joint = 3: the robot has joints 1 to 2"
-    );
+    assert_eq!(says("joint = 1", "joint = 3"), "skin.toml:41: cell[1].joint = 3: use a joint from 1 to 2");
     assert_eq!(
         says("[0.7071068, 0.0, 0.0, 0.7071068]", "[0.5, 0.0, 0.0, 0.5]"),
         "skin.toml:43: cell[1].orientation = [0.5, 0, 0, 0.5]: \
@@ -117,8 +114,8 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("[0.1, 0.0, 0.06]", "[1.6, 0.0, 0.0]"),
-        "skin.toml:34: cell[0].position = [1.6, 0, 0]: node 1 can be 2.100 m away from a frame of its rows, \
-         0.101 m more than the 1.999 m that fit into Q1.14"
+        "skin.toml:34: cell[0].position = [1.6, 0, 0]: the distance from node 1 to a joint frame of its \
+         chain can reach 2.100 m, 0.101 m more than Q1.14 can hold (1.999 m)"
     );
     assert_eq!(
         says("[controller]", "[[bus]]\nname = \"vcan0\"\nreply = \"torque\"\nformat = \"fd\"\n[controller]"),
@@ -278,13 +275,15 @@ fn sums_need_a_tree_that_reaches_everyone_and_fits_the_period() {
         "skin.toml:21: bus[0].reply = \"sum\": sums need a path to the gateway, but no cell of this bus has \
          root = true: set it for one cell"
     );
-    let link_down = |cells: &[_]| fault(without, cells).split_once(": no wires").unwrap().1.to_owned();
+    let link_down =
+        |cells: &[_]| fault(without, cells).split_once(": no path of wires").unwrap().1.to_owned();
     cells = CHAIN;
     (cells[1].0, cells[2].0) = ([1, 0, 0, 0], [0, 4, 0, 0]);
     assert_eq!(
         fault(without, &cells),
-        "skin.toml:50: cell[2].node = 3: no wires lead from a root of its bus to this cell (nor to another cell), \
-         but sums need them: name neighbors at both ends, or set root = true"
+        "skin.toml:50: cell[2].node = 3: no path of wires leads from a root of its bus to this cell (and \
+         none to 1 other cell), but sums need one: name the neighbors at both ends of each wire, or set root \
+         = true for a cell"
     );
     assert_eq!(
         parse("reply = \"torque\"", &cells).unwrap().wires(0).cell_depths()[..4],
@@ -292,12 +291,12 @@ fn sums_need_a_tree_that_reaches_everyone_and_fits_the_period() {
     );
     assert!(
         link_down(&[([0; 4], true), ([0; 4], false)])
-            .starts_with(" lead from a root of its bus to this cell, but")
+            .starts_with(" leads from a root of its bus to this cell, but")
     );
     let three = [([0; 4], true), ([0; 4], false), ([0; 4], false), ([0; 4], false)];
     assert!(
         link_down(&three)
-            .starts_with(" lead from a root of its bus to this cell (nor to 2 other cells), but")
+            .starts_with(" leads from a root of its bus to this cell (and none to 2 other cells), but")
     );
 }
 

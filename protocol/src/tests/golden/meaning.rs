@@ -443,7 +443,7 @@ impl<'a> Meaning<'a> {
                     "7-or-8" => "7 or 8",
                     "9-or-10" => "9 or 10",
                     "11-to-14" => "11 to 14",
-                    "1-to-255-or-0-with-zeros" => "1 to 255, or 0 with zeros",
+                    "1-to-255-or-0-with-zeros" => "1 to 255, or 0 if all words are 0",
                     other => panic!("{text}: {other}"),
                 },
             }),

@@ -229,7 +229,7 @@ pub enum MessageError {
         page: u8,
     },
     /// The count byte is out of range for this kind.
-    #[error("{kind} with count {got}; {allowed} is allowed", kind = .kind.name())]
+    #[error("{kind} with count {got}; allowed: {allowed}", kind = .kind.name())]
     Count {
         /// The kind of the packet.
         kind: Kind,
@@ -264,7 +264,11 @@ impl Message {
                 }
             },
             Kind::Sum if count == 0 && !words.is_zero() => {
-                return Err(MessageError::Count { kind, got: count, allowed: "1 to 255, or 0 with zeros" });
+                return Err(MessageError::Count {
+                    kind,
+                    got: count,
+                    allowed: "1 to 255, or 0 if all words are 0",
+                });
             }
             Kind::Sum => Self::Sum { from: sender()?, epoch, torque: words, count },
             Kind::Torque if count != 1 => {

@@ -23,10 +23,10 @@ fn what_cannot_be_is_refused_with_the_value() {
         says(0x005, 0),
         "command 5 does not exist: use 0 halt, 1 joints, 2 sync, 3 resume or 4 report"
     );
-    assert_eq!(says(0x001, 7), "command with count 7; 1 to 6 is allowed");
+    assert_eq!(says(0x001, 7), "command with count 7; allowed: 1 to 6");
     assert_eq!(says(0x200, 1), "torque from node 0, which is not a cell");
     assert_eq!(says(0x2FF, 1), "torque from node 255, which is not a cell");
-    assert_eq!(says(0x201, 2), "torque with count 2; 1 is allowed");
+    assert_eq!(says(0x201, 2), "torque with count 2; allowed: 1");
     assert_eq!(says(0x301, 2), "sensors page 2 does not exist");
     assert_eq!(says(0x701, 3), "stimulus page 3 does not exist");
     assert_eq!(says(0x401, 9), "network page 9 does not exist");

@@ -85,7 +85,8 @@ fn a_directory_that_others_can_enter_is_refused_by_both_sides() {
     std::fs::create_dir(&directory).unwrap();
     std::fs::set_permissions(&directory, std::fs::Permissions::from_mode(0o755)).unwrap();
     let expected = format!(
-        "{} has mode 0755, but the bus must be private: `chmod 700` it, or set SKINBUS_DIR to another directory",
+        "the directory {} for embedded buses has mode 0755, so other users can open it: run `chmod 700` on \
+         it, or set SKINBUS_DIR to another directory",
         directory.display()
     );
     assert_eq!(ServerThread::start_in(&directory, BUS).unwrap_err().to_string(), expected);
@@ -101,14 +102,14 @@ fn a_link_a_file_in_the_way_and_a_path_that_is_too_long_are_refused() {
     drop(protocol::bus::embedded::make_directory(&real).unwrap());
     std::os::unix::fs::symlink(&real, &link).unwrap();
     let error = ServerThread::start_in(&link, BUS).unwrap_err().to_string();
-    assert!(error.starts_with(&format!("cannot use {} as the directory", link.display())), "{error}");
+    assert!(error.starts_with(&format!("cannot use the directory {} for embedded buses", link.display())), "{error}");
 
     std::fs::write(real.join("vcan0.bus"), "").unwrap();
     let error = ServerThread::start_in(&real, BUS).unwrap_err().to_string();
     assert!(error.ends_with("vcan0.bus exists and is not a socket: move it away"), "{error}");
 
     let error = ServerThread::start_in(&parent.path().join("x".repeat(100)), BUS).unwrap_err().to_string();
-    assert!(error.contains("is too long for a socket"), "{error}");
+    assert!(error.contains("is too long for a Unix socket"), "{error}");
     let error = ServerThread::start_in(&real, "a/b").unwrap_err().to_string();
     assert!(error.starts_with("\"a/b\" is not a valid bus name"), "{error}");
     let error = ServerThread::start_in(&parent.path().join("no/such"), BUS).unwrap_err().to_string();
