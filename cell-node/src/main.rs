@@ -34,7 +34,7 @@ struct Arguments {
     /// Node id of the cell on the bus, 1 to 254
     #[arg(long, value_name = "N", required_unless_present = "nodes")]
     node: Option<u8>,
-    /// Run several cells in one process over one socket; give the first and last node id
+    /// Run the cells with these node ids, first to last, in one process over one socket
     #[arg(long, value_name = "A-B", conflicts_with = "node", value_parser = parse_range)]
     nodes: Option<(u8, u8)>,
     /// Skin file; a cell with empty flash gets its parameters from it
@@ -43,8 +43,8 @@ struct Arguments {
     /// Keep the parameters of cells in files in this directory; without it, they are lost when the process ends
     #[arg(long, value_name = "DIR")]
     flash: Option<PathBuf>,
-    /// Start cells as they leave the factory: without parameters and, on a bus with sums, without a node id;
-    /// `skinbus commission` and the network assign these. Contents of existing --flash files are used
+    /// Start new cells: without parameters and, on a bus with sums, without node ids, which the network assigns;
+    /// `skinbus commission` writes the parameters. Cells with a file in --flash start with what it contains
     #[arg(long)]
     fresh: bool,
     /// Wait for the bus at the start, and reopen it when it is lost, instead of exiting
@@ -52,8 +52,8 @@ struct Arguments {
     reconnect: bool,
     #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto, help = BusKind::help())]
     bus_kind: KindChoice,
-    /// Compute with the sine of this build, eighths, or with that of earlier builds, seventh-order. The last bits of
-    /// torques depend on it, which `skinbus replay` compares
+    /// Sine function for the torques: eighths, or seventh-order, as in recordings of earlier builds. It affects only
+    /// the last bits, which `skinbus replay` compares
     #[arg(long, value_name = "NAME", default_value_t)]
     sine: SineMethod,
     /// Exit when the parent process with this id ends
@@ -66,7 +66,7 @@ fn parse_range(text: &str) -> Result<(u8, u8), String> {
         text.split_once('-').and_then(|(first, last)| Some((first.parse().ok()?, last.parse().ok()?)));
     node_ids
         .filter(|&(first, last)| 1 <= first && first <= last && last <= CellId::MAX.get())
-        .ok_or_else(|| "give two node ids from 1 to 254, the smaller one first, such as 1-64".to_owned())
+        .ok_or_else(|| "use two node ids from 1 to 254, the smaller one first, such as 1-64".to_owned())
 }
 
 impl Arguments {
@@ -143,7 +143,11 @@ fn prepare_cells(arguments: &Arguments) -> Result<(HostedCells, Sockets, BusPort
     let skin = Skin::read_for_bus(&arguments.skin, &arguments.bus)?;
     let bus_index = skin.bus_index(&arguments.bus).with_context(|| {
         let names = skin.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
-        format!("bus {} is not in {}, which has {names}", arguments.bus, arguments.skin.display())
+        format!(
+            "the skin file {1} has no bus {0}; its buses are {names}",
+            arguments.bus,
+            arguments.skin.display()
+        )
     })?;
     let bus = skin.buses.get(bus_index).context("the bus that was found")?;
     let wires = match bus.reply {
@@ -185,7 +189,11 @@ fn start_cell(
 ) -> Result<()> {
     let described =
         skin.cells_on_bus(bus_index).find(|described| described.node == cell).with_context(|| {
-            format!("cell {cell} is not on {} in {}", arguments.bus, arguments.skin.display())
+            format!(
+                "the skin file {1} has no cell {cell} on bus {0}",
+                arguments.bus,
+                arguments.skin.display()
+            )
         })?;
     // A cell without wires is never assigned a node id.
     let is_nameless = arguments.fresh && wires.is_some();
