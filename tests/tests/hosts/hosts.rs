@@ -340,7 +340,7 @@ fn a_circle_that_something_else_makes_is_cut_and_said() {
     };
     until("the circle to be noticed", || {
         pass_on();
-        links.iter().any(|link| link.stderr().contains("return from this bus")).then_some(())
+        links.iter().any(|link| link.stderr().contains("come back over this bus")).then_some(())
     });
     for _ in 0..50 {
         pass_on();

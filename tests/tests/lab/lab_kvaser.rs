@@ -458,6 +458,6 @@ fn a_controller_that_is_not_ready_is_refused_with_the_hint() {
     tool("ip link set can0 up");
     open("can0", &options(&[Filter::ALL])).unwrap();
     let error = open("can0", &BusOptions { fd: true, ..options(&[]) }).unwrap_err().to_string();
-    assert!(error.starts_with("can0 has MTU 16 and CAN FD needs 72"), "{error}");
+    assert!(error.starts_with("can0 has MTU 16, but CAN FD needs 72"), "{error}");
     assert!(error.contains("or use the classic format"), "{error}");
 }

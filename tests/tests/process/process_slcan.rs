@@ -165,7 +165,7 @@ fn garbage_is_counted_and_what_follows_it_is_read() {
     assert_eq!(bench.receives(1), [frame]);
     bench.client.send(&[Frame::fd(1, 1, &[]).unwrap(), frame]).unwrap();
     assert_eq!(pty.peer.receives(1), [frame]);
-    until("the losses", || bridge.stderr().contains("FD frames for a classic adapter").then_some(()));
+    until("the losses", || bridge.stderr().contains("FD frames, but the adapter is classic").then_some(()));
     let [line] = ended(bridge).try_into().unwrap();
     assert_eq!(line["to_line"]["dropped"]["not_classic"], 1);
     let refused = serde_json::json!({"garbage": 1, "long": 1, "short": 1, "dlc": 1, "identifier": 1});
@@ -186,7 +186,8 @@ fn an_adapter_that_was_deaf_when_it_was_opened_is_opened_again_at_its_first_refu
     pty.peer.write_bytes(b"\x07");
     pty.peer.wait_for_text("\rC\rS6\rY0\rO\r");
     bridge.wait_for_stderr("the adapter refuses frames (BEL)");
-    bridge.wait_for_stderr("1 more frames to the line lost; in total 1 dropped (refused by the adapter: 1)");
+    bridge
+        .wait_for_stderr("1 more frames to the line were lost; total: 1 dropped (refused by the adapter: 1)");
     // It is open now.
     pty.peer.write_bytes(b"\r\r\r");
     bench.client.send(&frames[1..]).unwrap();
@@ -209,7 +210,7 @@ fn a_bit_rate_that_an_adapter_does_not_have_is_reported() {
     pty.peer.write_bytes(b"\x07");
     pty.peer.wait_for_text("S6\r");
     pty.peer.write_bytes(b"\x07");
-    bridge.wait_for_stderr("the adapter refused a command of S6, Y2 (BEL)");
+    bridge.wait_for_stderr("the adapter refused one of the commands S6, Y2 (BEL)");
     pty.peer.wait_for_text("Y2\rO\r");
     let [line] = ended(bridge).try_into().unwrap();
     assert_eq!((&line["reopened"], &line["to_line"]["dropped"]["refused"]), (&0.into(), &0.into()), "{line}");
@@ -419,7 +420,7 @@ fn what_cannot_be_is_refused_in_one_line() {
     let _listener = UnixListener::bind(&socket).unwrap();
     let refused = |words: &str, code| bench.slcan(words).end().refusal(code).to_owned();
     let cannot = |what: &str, why: &str| {
-        format!("vcan-setup: cannot open {what}: {why}; with --wait, it is opened when it becomes available")
+        format!("vcan-setup: cannot open {what}: {why}; with --wait, this command opens it when it appears")
     };
     assert_eq!(refused("/dev/none", 1), cannot("/dev/none", "No such file or directory (os error 2)"));
     assert_eq!(refused("unix:/none", 1), cannot("unix:/none", "No such file or directory (os error 2)"));

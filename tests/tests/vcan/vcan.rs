@@ -146,7 +146,7 @@ fn an_interface_that_goes_down_and_up_and_away_is_told_apart() {
     ip("link set vcan9 mtu 16");
     ip("link set vcan9 up");
     let error = open().unwrap_err().to_string();
-    assert!(error.starts_with("vcan9 has MTU 16 and CAN FD needs 72"), "{error}");
+    assert!(error.starts_with("vcan9 has MTU 16, but CAN FD needs 72"), "{error}");
     Bus::open("vcan9", KindChoice::Auto, &BusOptions { fd: false, ..BusOptions::default() }).unwrap();
     ip("link set vcan9 down");
     ip("link set vcan9 mtu 72");

@@ -123,7 +123,7 @@ fn an_interface_that_is_removed_and_made_again_is_opened_again() {
     answers(&place, 1);
     // First with the wrong setting, which is reported, and then with the right one.
     let narrow = Vcan::with_mtu("vcan2", 16);
-    bench.wait_for_stderr("vcan2 cannot be reopened yet: vcan2 has MTU 16 and CAN FD needs 72");
+    bench.wait_for_stderr("vcan2 cannot be reopened yet: vcan2 has MTU 16, but CAN FD needs 72");
     narrow.remove();
     let _vcan2 = Vcan::make("vcan2");
     bench.wait_for_stderr("vcan2 works again");

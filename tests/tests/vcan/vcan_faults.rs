@@ -236,7 +236,7 @@ fn a_bus_that_cannot_be_used_is_refused_with_its_hint() {
     };
     says("vcan0", DOWN);
     let _narrow = Vcan::with_mtu("vcan6", 16);
-    says("vcan6", "vcan6 has MTU 16 and CAN FD needs 72: set it with `");
+    says("vcan6", "vcan6 has MTU 16, but CAN FD needs 72: set it with `");
     says("vcan7", "there is no interface vcan7: make it with `");
     says("lo", "lo is not a CAN interface");
 }

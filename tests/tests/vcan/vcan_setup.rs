@@ -171,7 +171,7 @@ fn what_is_not_ours_is_never_touched() {
     let repairs = "sudo sh -c 'ip link set vcan20 down && ip link set vcan20 mtu 72 up'";
     assert_eq!(
         fails("up vcan21 vcan20", 1),
-        format!("vcan20 has MTU 16 and CAN FD needs 72; {why}: `{repairs}` fixes it")
+        format!("vcan20 has MTU 16, but CAN FD needs 72; {why}: `{repairs}` fixes it")
     );
     assert_eq!(
         fails("down vcan20", 2),

@@ -42,14 +42,14 @@ impl fmt::Display for LinkEvent {
             Self::BusBack => f.write_str("the bus is available again"),
             Self::Garbage(host, why) => write!(f, "host '{host}' sent invalid data: {why}"),
             Self::Circle => f.write_str(
-                "frames of other hosts return from this bus and are not sent again: something else joins the \
-                 buses too, such as a second link or an adapter; remove one of them",
+                "frames from other hosts come back over this bus, and the link drops them: a second link or \
+                 an adapter also connects the buses; remove one of the connections",
             ),
             Self::SameName(host) => {
                 write!(f, "two hosts have the name '{host}': give each its own name with --host")
             }
             Self::Lost { from_here, from_others } => {
-                write!(f, "lost: {from_here} frames from this host, {from_others} from other hosts")
+                write!(f, "the link lost {from_here} frames from this host and {from_others} from other hosts")
             }
         }
     }

@@ -163,7 +163,7 @@ impl HostLink {
         let (shared, this) = (Arc::clone(&self.shared), host.clone());
         self.subscribe(HEARD, tell.clone(), move |from, bytes| {
             let heard: BTreeMap<String, SourceAccount> = serde_json::from_slice(bytes)
-                .map_err(|error| format!("the account of received frames cannot be decoded: {error}"))?;
+                .map_err(|error| format!("its counts of received frames cannot be decoded: {error}"))?;
             let mut ours = shared.ours();
             if let Some(heard) =
                 heard.get(&this).filter(|_| ours.len() < MAX_SOURCES || ours.contains_key(from))

@@ -79,12 +79,14 @@ fn json(report: &LinkReport) -> Result<String, Failure> {
 fn text(report: &LinkReport) -> String {
     let LinkReport { sent, hosts, returned, .. } = report;
     let mut text = format!(
-        "from this host: {} frames read, {} sent in {} messages, {} dropped, {} missed\n",
+        "from this host: {} frames read, {} sent in {} messages, {} dropped by the link, {} lost before the \
+         link read them\n",
         sent.taken, sent.sent, sent.messages, sent.dropped, sent.missed
     );
     for (host, HostReport { heard, .. }) in hosts {
         text += &format!(
-            "from '{host}': {} frames received, {} sent to the bus; lost: {} on the way, {} there, {} here; {} sent before the link began\n",
+            "from '{host}': {} frames received, {} sent to the bus; lost: {} on the network, {} on that \
+             host, {} on this host; {} sent before this link started\n",
             heard.taken,
             heard.sent,
             heard.lost,
@@ -95,7 +97,8 @@ fn text(report: &LinkReport) -> String {
     }
     if *returned > 0 {
         text += &format!(
-            "{returned} frames of other hosts returned from the bus of this host, and were not sent again\n"
+            "{returned} frames from other hosts came back over the bus of this host, and the link dropped \
+             them\n"
         );
     }
     text

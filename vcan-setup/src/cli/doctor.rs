@@ -23,7 +23,7 @@ use super::{buses_from_arguments, query_interfaces, to_json};
   vcan-setup doctor skin.toml --no-spawn           its cells are on the bus already
   vcan-setup doctor can0 --bus-kind socketcan")]
 pub(crate) struct DoctorOptions {
-    /// Names of buses, or skin files, which end in .toml or contain a '/'
+    /// Names of buses, or skin files (an argument that ends in .toml or contains a '/')
     #[arg(value_name = "SKIN.toml|NAME")]
     what: Vec<OsString>,
     #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto, help = BusKind::help())]

@@ -137,5 +137,5 @@ fn query_interfaces() -> Result<(Netlink, Vec<Interface>), Failure> {
 }
 
 fn query_error(error: io::Error) -> Failure {
-    Failure::run_error(format!("cannot query the interfaces of the kernel: {error}"))
+    Failure::run_error(format!("cannot read the kernel's list of network interfaces: {error}"))
 }

@@ -28,7 +28,7 @@ const HIGHEST_PRIORITY: i32 = -20;
     after_help = "Examples:\n  vcan-setup serve vcan0\n  sleep 10 | vcan-setup serve vcan0 --until-eof"
 )]
 pub(crate) struct ServeBusOptions {
-    /// Name of the bus, like that of an interface: at most 15 bytes
+    /// Name of the bus, at most 15 bytes, as for a network interface
     #[arg(value_parser = parse_bus_name)]
     name: String,
     /// Also stop when standard input ends or the parent process dies. Each line "report" on standard input prints the
@@ -135,8 +135,8 @@ fn serve(options: &ServeBusOptions) -> anyhow::Result<()> {
     // Only the server can report these frames, because a client gets no error for an invalid datagram.
     if garbage > 0 || refused > 0 {
         print_to_stderr(&format!(
-            "{name}: ignored {garbage} datagrams that were neither frames nor filters, and refused {refused} clients: \
-             check the client programs against docs/reference/embedded-bus.md"
+            "{name}: ignored {garbage} invalid datagrams and refused {refused} clients: check the client \
+             programs against docs/reference/embedded-bus.md"
         ));
     }
     if turned_away > 0 {

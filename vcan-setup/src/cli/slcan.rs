@@ -33,30 +33,30 @@ pub(crate) struct SlcanOptions {
     /// Name of the bus
     #[arg(value_parser = parse_bus_name)]
     bus: String,
-    /// Serial lines: PATH, unix:PATH or tcp:HOST:PORT, each followed by its options after commas
+    /// Serial lines to the adapters: PATH, unix:PATH or tcp:HOST:PORT, each with options after commas, such as ,cell=12
     #[arg(value_name = "LINE", required = true)]
     lines: Vec<LineOptions>,
-    /// Node id of the cell behind each LINE, in the order of the lines
+    /// Node id of the cell on each LINE; repeat the option in the order of the lines
     #[arg(long, value_name = "N", value_parser = parse_cell_id)]
     cell: Vec<CellId>,
     /// Bit rates to set in the adapters, such as 500k or 1M/5M [default: unchanged]
     #[arg(long, value_name = "RATES")]
     bit_rates: Option<BitRates>,
-    /// Speed of the terminals in bit/s [default: unchanged]
+    /// Baud rate of the serial ports in bit/s [default: unchanged]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     baud: Option<u32>,
-    /// Drop FD frames, because the adapters have no CAN FD
+    /// The adapters support classic CAN only: FD frames from the bus are dropped
     #[arg(long)]
     classic: bool,
-    /// Seconds to wait after a line is opened, for boards that are reset when it is opened (Arduino, ESP32)
+    /// Seconds to wait after opening a line, for boards that opening the line resets (Arduino, ESP32)
     #[arg(long, value_name = "SECONDS", value_parser = parse_settle)]
     settle: Option<Duration>,
-    /// Start even if lines are unavailable, and open them later
+    /// Start even if lines cannot be opened yet, and open them when they appear
     #[arg(long)]
     wait: bool,
     #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto, help = BusKind::help())]
     bus_kind: KindChoice,
-    /// Print the counts of all frames as JSON
+    /// At the end, print the counts of all frames as JSON
     #[arg(long)]
     json: bool,
 }
@@ -120,7 +120,8 @@ impl SlcanOptions {
         let mut lines = self.lines.clone();
         if !self.cell.is_empty() && self.cell.len() != lines.len() {
             return Err(Failure::usage_error(format!(
-                "{} --cell options for {} lines: give one for each line, or write /dev/ttyACM0,cell=12",
+                "there are {} --cell options for {} lines: give one for each line, or write \
+                 /dev/ttyACM0,cell=12",
                 self.cell.len(),
                 lines.len()
             )));

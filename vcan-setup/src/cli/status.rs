@@ -28,7 +28,7 @@ const ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
   vcan-setup status
   vcan-setup status skin.toml --json")]
 pub(crate) struct StatusOptions {
-    /// Show only these buses: names, or skin files, which end in .toml or contain a '/'
+    /// Show only these buses: names, or skin files (an argument that ends in .toml or contains a '/')
     #[arg(value_name = "SKIN.toml|NAME")]
     what: Vec<OsString>,
     /// Print JSON

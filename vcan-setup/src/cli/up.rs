@@ -31,16 +31,16 @@ use super::{BusArgument, parse_argument, query_error, query_interfaces, targets_
   sudo vcan-setup up vcan0 --peer vcan0 --namespace blue      a pair that leads into a namespace
   sudo vcan-setup up skin.toml --set-bit-rates                also set the bit rates of real interfaces")]
 pub(crate) struct UpOptions {
-    /// Names of interfaces, or skin files, which end in .toml or contain a '/'
+    /// Names of interfaces, or skin files (an argument that ends in .toml or contains a '/')
     #[arg(required = true, value_name = "SKIN.toml|NAME")]
     what: Vec<OsString>,
-    /// Print what would be done, and do nothing
+    /// Print the steps and commands, but do not execute them
     #[arg(long)]
     dry_run: bool,
-    /// Make a vxcan pair: NAME is one end, PEER the other
+    /// Make a vxcan pair instead of a vcan: NAME is one end, PEER the other
     #[arg(long, value_name = "PEER")]
     peer: Option<String>,
-    /// Network namespace of the other end: a name, a path, or a process id
+    /// Network namespace of the PEER end: a name, a path, or a process id
     #[arg(long, value_name = "NAME|PATH|PID", requires = "peer")]
     namespace: Option<OsString>,
     /// Set the bit rates of CAN hardware to those of the skin; takes the interface down for a moment
@@ -57,10 +57,10 @@ pub(crate) struct UpOptions {
   sudo vcan-setup down skin.toml
   vcan-setup down --dry-run vcan0")]
 pub(crate) struct DownOptions {
-    /// Names of interfaces, or skin files, which end in .toml or contain a '/'
+    /// Names of interfaces, or skin files (an argument that ends in .toml or contains a '/')
     #[arg(required = true, value_name = "SKIN.toml|NAME")]
     what: Vec<OsString>,
-    /// Print what would be done, and do nothing
+    /// Print the steps and commands, but do not execute them
     #[arg(long)]
     dry_run: bool,
 }

@@ -141,7 +141,7 @@ impl MachineFacts {
             if *ours { self.up_command(&bus.target) } else { command }
         };
         if !bus.target.fits_mtu(*mtu) {
-            let text = format!("{name} has MTU {mtu} and CAN FD needs {FD_MTU}");
+            let text = format!("{name} has MTU {mtu}, but CAN FD needs {FD_MTU}");
             return vec![Finding::fault(text).with_hint(repair(set_fd_mtu_command("ip", name)))];
         }
         if !up {

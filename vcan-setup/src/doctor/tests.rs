@@ -249,7 +249,7 @@ fn a_missing_interface_is_made_by_up_and_who_may_not_needs_sudo() {
 
 #[test]
 fn an_interface_that_does_not_fit_is_repaired_by_who_made_it() {
-    let narrow = "fault: vcan0 has MTU 16 and CAN FD needs 72";
+    let narrow = "fault: vcan0 has MTU 16, but CAN FD needs 72";
     assert_eq!(about_interface(|it| it.mtu = 16), [format!("{narrow} | sudo vcan-setup up skin.toml")]);
     assert_eq!(
         about_interface(|it| (it.mtu, it.ours) = (16, false)),

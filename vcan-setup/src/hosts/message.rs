@@ -70,7 +70,8 @@ pub enum MessageError {
     /// The numbers in the header are impossible: a frame number would exceed 2^64, or more frames were dropped than
     /// numbered.
     #[error(
-        "a message has impossible numbers: {first} for its first frame, and {dropped} frames dropped before it"
+        "a message has inconsistent counts: its first frame has number {first}, but {dropped} frames were \
+         dropped before it"
     )]
     Numbers {
         /// The number of the first frame.

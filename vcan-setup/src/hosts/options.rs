@@ -26,19 +26,19 @@ pub struct LinkOptions {
     /// Configuration file of Zenoh, with certificates, access control and endpoints
     #[arg(long, value_name = "FILE.json5")]
     pub config: Option<PathBuf>,
-    /// Connect to this host: tcp/HOST:PORT or tls/HOST:PORT; may be repeated for further hosts
+    /// Connect to the link on another host: tcp/HOST:PORT or tls/HOST:PORT; repeat the option for further hosts
     #[arg(long, value_name = "ENDPOINT")]
     pub connect: Vec<String>,
-    /// Accept connections of other hosts at this address
+    /// Accept connections from other hosts at this address of this host
     #[arg(long, value_name = "ENDPOINT")]
     pub listen: Vec<String>,
-    /// Name of this host for the other hosts [default: the name of the machine]
+    /// Name under which other hosts see this host [default: the name of the machine]
     #[arg(long, value_name = "NAME")]
     pub host: Option<String>,
     /// The requested kind of the bus.
     #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto, help = BusKind::help())]
     pub bus_kind: KindChoice,
-    /// Print the counts of all frames as JSON
+    /// At the end, print the counts of all frames as JSON
     #[arg(long)]
     pub json: bool,
 }

@@ -33,7 +33,7 @@ pub enum PlanRefusal {
     },
     /// The interface has too small an MTU, and another program has made it.
     #[error(
-        "{name} has MTU {mtu} and CAN FD needs {FD_MTU}; vcan-setup did not make it and does not change it: \
+        "{name} has MTU {mtu}, but CAN FD needs {FD_MTU}; vcan-setup did not make it and does not change it: \
          `sudo sh -c '{}'` fixes it",
         set_fd_mtu_command("ip", name)
     )]
@@ -62,7 +62,8 @@ pub enum PlanRefusal {
     },
     /// The other end of an existing pair is down or has too small an MTU, and is in another namespace.
     #[error(
-        "the other end of {name}, {end}; vcan-setup changes nothing in another namespace: `sudo {command}` fixes it"
+        "the other end of {name}, {end}; vcan-setup changes nothing in another namespace: `sudo {command}` \
+         fixes it"
     )]
     OtherEnd {
         /// The name of the end in this namespace.
@@ -90,7 +91,8 @@ pub enum PlanRefusal {
     },
     /// Two skins state different bit rates for the same bus.
     #[error(
-        "two skins differ on the bit rates of {name}: {one}, {other}; run `vcan-setup up` with one of them, or make them agree"
+        "two skins differ on the bit rates of {name}: {one}, but {other}; run `vcan-setup up` with one of \
+         the skins, or correct one of them"
     )]
     AtOdds {
         /// The name of the bus.

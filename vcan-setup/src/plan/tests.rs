@@ -87,7 +87,7 @@ fn what_somebody_else_made_is_left_alone_and_the_hint_is_told() {
     let foreign = |mtu, up| Interface { mtu, up, ..interface("vcan0", 2, InterfaceKind::Vcan) };
     assert_eq!(
         refused(&InterfaceTarget::named("vcan0"), &[foreign(16, true)]),
-        "vcan0 has MTU 16 and CAN FD needs 72; vcan-setup did not make it and does not change it: `sudo sh \
+        "vcan0 has MTU 16, but CAN FD needs 72; vcan-setup did not make it and does not change it: `sudo sh \
          -c 'ip link set vcan0 down && ip link set vcan0 mtu 72 up'` fixes it"
     );
     assert_eq!(
@@ -190,8 +190,8 @@ fn two_skins_that_give_a_bus_two_bit_rates_are_refused() {
             let refusal = plan_up(&[skin(Some(500_000)), skin(Some(250_000))], &present, set).unwrap_err();
             assert_eq!(
                 refusal.to_string(),
-                "two skins differ on the bit rates of can0: skin.toml requires 500 kbit/s, skin.toml requires 250 kbit/s; run `vcan-setup up` with one of \
-                 them, or make them agree"
+                "two skins differ on the bit rates of can0: skin.toml requires 500 kbit/s, but skin.toml \
+                 requires 250 kbit/s; run `vcan-setup up` with one of the skins, or correct one of them"
             );
             assert!(refusal.is_usage());
         }

@@ -133,10 +133,10 @@ impl BusToLineDropCounts {
         [
             (self.queue_full, "line too slow"),
             (self.line_away, "line unavailable"),
-            (self.not_classic, "FD frames for a classic adapter"),
+            (self.not_classic, "FD frames, but the adapter is classic"),
             (self.error_frame, "error frames"),
             (self.refused, "refused by the adapter"),
-            (self.ended, "not sent before the end"),
+            (self.ended, "still queued at the end"),
         ]
     }
 }
@@ -150,10 +150,10 @@ impl LineToBusDropCounts {
 
     const fn named_counts(&self) -> [(u64, &'static str); 4] {
         [
-            (self.queue_full, "bus full"),
+            (self.queue_full, "bus queue full"),
             (self.bus_away, "bus unavailable"),
-            (self.not_classic, "FD frames for a classic bus"),
-            (self.ended, "not sent before the end"),
+            (self.not_classic, "FD frames, but the bus is classic"),
+            (self.ended, "still queued at the end"),
         ]
     }
 }
@@ -214,9 +214,9 @@ impl fmt::Display for LineAccount {
     /// Writes three lines, or four if the adapter reported faults, without a line feed at the end.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { line, opened, lost, reopened, to_line, to_bus, faults } = self;
-        write!(f, "{line}: opened {}, lost {}", times_text(*opened), times_text(*lost))?;
+        write!(f, "{line}: opened {}, lost the connection {}", times_text(*opened), times_text(*lost))?;
         if *reopened > 0 {
-            write!(f, ", reopened after refusals {}", times_text(*reopened))?;
+            write!(f, ", reopened {} because the adapter refused frames", times_text(*reopened))?;
         }
         write!(
             f,
@@ -246,7 +246,8 @@ mod tests {
             LineAccount { line: "/dev/ttyACM0".to_owned(), opened: 2, lost: 1, ..LineAccount::default() };
         assert_eq!(
             account.to_string(),
-            "/dev/ttyACM0: opened 2 times, lost once\n  to the line: 0 received, 0 sent\n  to the bus:  0 received, 0 sent"
+            "/dev/ttyACM0: opened 2 times, lost the connection once\n  to the line: 0 received, 0 sent\n  to \
+             the bus:  0 received, 0 sent"
         );
         account.to_line = BusToLineCounts {
             received: 23,
@@ -271,17 +272,20 @@ mod tests {
         };
         assert_eq!(
             account.to_string(),
-            "/dev/ttyACM0: opened 2 times, lost once\n  to the line: 23 received, 1 sent, 22 dropped (line too \
-             slow: 1, line unavailable: 2, FD frames for a classic adapter: 3, error frames: 4, refused by the \
-             adapter: 7, not sent before the end: 5), 6 not received (dropped by the bus: 6)\n  to the bus:  11 \
-             received, 1 sent, 10 dropped (bus full: 1, bus unavailable: 2, FD frames for a classic bus: 3, not \
-             sent before the end: 4), 6 lines refused (invalid characters: 1, too short: 2, wrong identifier: \
-             3), BEL received 7 times"
+            "/dev/ttyACM0: opened 2 times, lost the connection once\n  to the line: 23 received, 1 sent, 22 \
+             dropped (line too slow: 1, line unavailable: 2, FD frames, but the adapter is classic: 3, error \
+             frames: 4, refused by the adapter: 7, still queued at the end: 5), 6 not received (dropped by \
+             the bus: 6)\n  to the bus:  11 received, 1 sent, 10 dropped (bus queue full: 1, bus \
+             unavailable: 2, FD frames, but the bus is classic: 3, still queued at the end: 4), 6 lines \
+             refused (invalid characters: 1, too short: 2, wrong identifier: 3), BEL received 7 times"
         );
         (account.reopened, account.faults) = (1, FaultCounts::from([("no ACK", 3), ("bus off", 1)]));
         let text = account.to_string();
         assert!(
-            text.starts_with("/dev/ttyACM0: opened 2 times, lost once, reopened after refusals once\n"),
+            text.starts_with(
+                "/dev/ttyACM0: opened 2 times, lost the connection once, reopened once because \
+                              the adapter refused frames\n"
+            ),
             "{text}"
         );
         let end = ", BEL received 7 times\n  the adapter reported: bus off, no ACK (3 times)";

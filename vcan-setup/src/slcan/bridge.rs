@@ -196,7 +196,7 @@ fn line_error(line: String, source: io::Error) -> BridgeError {
     } else if source.kind() == io::ErrorKind::PermissionDenied {
         "; join the group that may use the device (`ls -l` shows it, often dialout)"
     } else {
-        "; with --wait, it is opened when it becomes available"
+        "; with --wait, this command opens it when it appears"
     };
     BridgeError::Line { line, source, hint }
 }

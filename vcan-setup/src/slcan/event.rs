@@ -48,7 +48,7 @@ impl fmt::Display for LineEvent {
             Self::Lost { to_line, to_bus, account } => {
                 let one = |count: u64, what, so_far: String| {
                     let so_far = so_far.trim_start_matches(", ");
-                    (count > 0).then(|| format!("{count} more {what} lost; in total {so_far}"))
+                    (count > 0).then(|| format!("{count} more {what} were lost; total: {so_far}"))
                 };
                 let lost = [
                     one(*to_line, "frames to the line", account.to_line.losses()),
@@ -58,16 +58,16 @@ impl fmt::Display for LineEvent {
             }
             Self::SettingRefused(commands) => write!(
                 f,
-                "the adapter refused a command of {commands} (BEL): it may not support these bit rates; give \
-                 rates that it supports, and classic if it has no CAN FD"
+                "the adapter refused one of the commands {commands} (BEL), perhaps because of the bit rates: \
+                 use --bit-rates that it supports, and --classic if it has no CAN FD"
             ),
             Self::Reopened => f.write_str(
-                "the adapter refuses frames (BEL): it is closed, was reset, or its queue is full; it is \
-                 opened again (a board that is reset when its line is opened needs settle=2)",
+                "the adapter refuses frames (BEL): it is closed, was reset, or its queue is full. The line \
+                 is now opened again; if opening it resets the board, add settle=2",
             ),
             Self::Reported(faults) => write!(f, "the adapter reports {faults}"),
             Self::NotClosed => {
-                f.write_str("the adapter was not closed, because it accepted no data at the end")
+                f.write_str("the adapter was not told to close its channel, because it accepted no more data")
             }
         }
     }

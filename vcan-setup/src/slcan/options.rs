@@ -217,7 +217,7 @@ impl LineOptions {
                 if self.filters.len() > Filter::MAX_COUNT {
                     return Err(wrong(&format!(
                         "these cells need {} filters, but a line can have at most {}: name fewer cells, or \
-                         none",
+                         leave out cell=",
                         self.filters.len(),
                         Filter::MAX_COUNT
                     )));
@@ -414,7 +414,7 @@ mod tests {
             (
                 "/dev/x,cell=1-254",
                 "/dev/x: \"cell=1-254\": these cells need 769 filters, but a line can have at most 512: name \
-                 fewer cells, or none",
+                 fewer cells, or leave out cell=",
             ),
             (
                 "/dev/x,filter=100",
