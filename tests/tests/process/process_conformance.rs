@@ -132,7 +132,7 @@ fn passes(format: Format) {
     assert_eq!(cell.has(), before, "it is left as it was");
     assert!(!cell.place.path("conformance-vcan0-5.json").exists());
     let junit = cell.place.read("cell.xml");
-    let case = "<testcase classname=\"cell.md\" name=\"CONF-7 commit of a configuration\"/>";
+    let case = "<testcase classname=\"cell.md\" name=\"CONF-7 a commit with the right hash puts the writes into effect\"/>";
     assert!(junit.contains(case), "{junit}");
     assert_eq!(junit.matches("<testcase").count(), requirements.len());
 }
