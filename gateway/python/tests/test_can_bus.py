@@ -207,7 +207,7 @@ def test_stopped_server_times_out(served: Served) -> None:
     with served.open() as bus:
         os.kill(served.server.pid, signal.SIGSTOP)
         began = time.monotonic()
-        with pytest.raises(can.CanTimeoutError, match=r"made no room for a frame within 0\.2 s"):
+        with pytest.raises(can.CanTimeoutError, match=r"accepted no frame within 0\.2 s"):
             send_many(bus, 10_000, timeout=0.2)
         with pytest.raises(can.CanTimeoutError, match="within 0 s"):
             bus.send(can.Message(), timeout=0)
@@ -315,9 +315,9 @@ def test_directories_of_others_are_refused(served: Served, tmp_path: Path) -> No
     link.symlink_to(served.directory)
     assert "cannot use" in failure(link)
     assert "start `vcan-setup serve vcan0`" in failure(tmp_path / "missing")
-    assert "is too long for a socket" in failure(tmp_path / ("x" * 100))
+    assert "is too long for a Unix socket" in failure(tmp_path / ("x" * 100))
     served.directory.chmod(0o750)
-    assert "has mode 0750, but the bus must be private: `chmod 700` it" in failure(served.directory)
+    assert "has mode 0750, so other users can open it: run `chmod 700` on it" in failure(served.directory)
     served.directory.chmod(0o700)
     if os.geteuid() == 0:
         os.chown(served.directory, 12345, -1)

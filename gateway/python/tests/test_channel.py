@@ -81,7 +81,9 @@ def test_a_press_without_a_verdict_ends_after_its_time(monkeypatch: pytest.Monke
     monkeypatch.setenv("FAKE", "no-verdict")
     with Bench("skin.toml") as bench:
         press = bench.press(3, 2, confirm=False)
-        with pytest.raises(TimeoutError, match=r"Press of vcan0:3, 2 N, from epoch 18>: no answer for 0.1 s"):
+        with pytest.raises(
+            TimeoutError, match=r"Press of vcan0:3, 2 N, from epoch 18>: the bench did not answer for 0.1 s"
+        ):
             press.wait(0.1)
 
 
@@ -93,7 +95,7 @@ def test_refused_commands_are_exceptions(fake: Bench) -> None:
     with pytest.raises(ValueError, match="JSON"):
         fake.press(1, float("nan"))
     for wrong in (13, "vcan1:3", "vcan0:13"):
-        with pytest.raises(ValueError, match="the skin does not have it"):
+        with pytest.raises(ValueError, match="the skin has no such cell"):
             fake.torque(wrong)
     fake.press(1, 1)
 
@@ -141,7 +143,7 @@ def test_epochs_whose_command_fails_are_counted_later(mode: str, monkeypatch: py
     monkeypatch.setenv("FAKE", mode)
     with Bench("skin.toml", timeout=0.5) as bench:
         if mode == "no-begin":
-            with pytest.raises(TimeoutError, match="epochs: no answer"):
+            with pytest.raises(TimeoutError, match="epochs: the bench did not answer"):
                 bench.wait_epochs(1)
         else:
             bench.wait_epochs(1)
@@ -188,9 +190,9 @@ def test_events_are_followed_until_the_end(fake: Bench) -> None:
 
 
 def test_to_follow_without_an_event_ends_after_its_time(fake: Bench) -> None:
-    with pytest.raises(TimeoutError, match=r"no event for 0.1 s"):
+    with pytest.raises(TimeoutError, match=r"the bench sent no event for 0.1 s"):
         next(fake.follow(start=1, timeout=0.1))
-    with pytest.raises(TimeoutError, match=r"Halted: no answer for 0.1 s"):
+    with pytest.raises(TimeoutError, match=r"Halted: the bench did not answer for 0.1 s"):
         fake.wait_for(skinbus.Halted, timeout=0.1)
 
 
@@ -317,7 +319,10 @@ def test_a_run_ends_although_a_fork_of_this_process_has_its_input(fake: Bench) -
 
 def test_a_silent_run_ends_after_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FAKE", "silent")
-    with pytest.raises(TimeoutError, match=r"press: no answer for 0.1 s"), Bench("skin.toml", timeout=0.1) as bench:
+    with (
+        pytest.raises(TimeoutError, match=r"press: the bench did not answer for 0.1 s"),
+        Bench("skin.toml", timeout=0.1) as bench,
+    ):
         bench.press(3, 2)
 
 
@@ -341,7 +346,7 @@ def test_a_folder_that_is_given_is_kept(tmp_path: Path) -> None:
 
 
 def test_a_bench_runs_once(fake: Bench) -> None:
-    with pytest.raises(RuntimeError, match="was started before"):
+    with pytest.raises(RuntimeError, match="was already started"):
         fake.start()
     with pytest.raises(RuntimeError, match="was not started"):
         Bench("skin.toml").report()

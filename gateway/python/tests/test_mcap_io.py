@@ -344,7 +344,7 @@ def test_cut_files_are_read_as_far_as_they_go(tmp_path: Path, caplog: pytest.Log
             got = [whole(frame) for frame in reader]
         assert got == expected[: len(got)]
         assert len(got) == len(expected) or caplog.messages == [
-            "the recording: its end is missing: it is read as far as it goes"
+            "the recording: its end is missing: only the existing part is read"
         ]
 
 

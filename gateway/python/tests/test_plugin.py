@@ -186,8 +186,8 @@ def test_a_run_that_cannot_start_is_an_error_with_its_line(
 @pytest.mark.parametrize(
     ("marker", "line"),
     [
-        ("", "*which skin? Mark the test with*"),
-        ("@pytest.mark.skin", "*the marker `skin` needs one path, of a skin"),
+        ("", "*the test has no skin: mark it with*"),
+        ("@pytest.mark.skin", "*the marker `skin` needs one argument, the path of a skin file"),
         ("@pytest.mark.skin('few.toml', colour=3)", "*unexpected keyword argument 'colour'"),
     ],
 )

@@ -54,5 +54,6 @@ def test_a_missing_program_is_an_error_that_says_what_to_do(tmp_path: Path, monk
 
 
 def test_only_the_programs_of_the_bench_are_searched() -> None:
-    with pytest.raises(ValueError, match="'sh' is not a program of the bench: skinbus, cell-node, vcan-setup"):
+    expected = "'sh' is not a program of the bench: use one of skinbus, cell-node, vcan-setup"
+    with pytest.raises(ValueError, match=expected):
         program_path("sh")

@@ -229,7 +229,7 @@ def test_the_index_is_used_again_until_the_file_changes(tmp_path: Path) -> None:
     os.utime(file, ns=(1, 1))
     assert read(file).index.stat().st_ino != made
     (tmp_path / "fd.mcap.columns" / "columns.json").write_text("{")
-    with pytest.raises(ReadFailed, match="it is a folder of other files"):
+    with pytest.raises(ReadFailed, match="the folder contains other files"):
         read(file)
 
 
@@ -276,7 +276,7 @@ def test_an_index_that_is_replaced_while_it_is_mapped_is_mapped_again(
     for name, column in index.columns.items():
         np.testing.assert_array_equal(column, np.load(place / f"{name}.npy"))
     replacements[:] = [1, count, count]
-    with pytest.raises(ReadFailed, match="is replaced by other programs while it is read"):
+    with pytest.raises(ReadFailed, match=r"other programs replaced .* while it was read"):
         _recording_index.load_index(place)
 
 

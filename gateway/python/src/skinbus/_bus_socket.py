@@ -84,7 +84,7 @@ def check_private(directory: Path) -> None:
         raise
     except OSError as error:
         raise AttachError(
-            f"cannot use {directory} as the directory of embedded buses: {error.strerror}; {advice}"
+            f"cannot use the directory {directory} for embedded buses: {error.strerror}; {advice}"
         ) from error
     try:
         about = os.fstat(descriptor)
@@ -92,13 +92,14 @@ def check_private(directory: Path) -> None:
         os.close(descriptor)
     if about.st_uid != os.geteuid():
         raise AttachError(
-            f"{directory} belongs to user {about.st_uid}, but this program runs as user {os.geteuid()}: {advice}"
+            f"the directory {directory} for embedded buses belongs to user {about.st_uid}, but this program runs as "
+            f"user {os.geteuid()}: {advice}"
         )
     mode = stat.S_IMODE(about.st_mode)
     if mode & 0o077:
         raise AttachError(
-            f"{directory} has mode {mode:04o}, but the bus must be private: `chmod 700` it, or set SKINBUS_DIR to "
-            "another directory"
+            f"the directory {directory} for embedded buses has mode {mode:04o}, so other users can open it: run "
+            "`chmod 700` on it, or set SKINBUS_DIR to another directory"
         )
 
 
@@ -124,7 +125,7 @@ def attach(
     path = socket_path(directory, name)
     if len(os.fsencode(path)) > _MAX_PATH_BYTES:
         raise AttachError(
-            f"{path} is too long for a socket, whose path can have at most {_MAX_PATH_BYTES} bytes: set SKINBUS_DIR to "
+            f"the path {path} is too long for a Unix socket, which allows {_MAX_PATH_BYTES} bytes: set SKINBUS_DIR to "
             "a shorter path"
         )
     hello = _HELLO.pack(_MAGIC, _VERSION, own_frames, fd, error_mask, receive_buffer, 0) + filters
@@ -209,7 +210,7 @@ def wait(client: socket.socket, events: int, timeout: float | None) -> bool:
 
 
 def _no_answer(path: Path) -> AttachError:
-    return AttachError(f"the server at {path} did not answer within {ANSWER_TIMEOUT_S:g} s: is it stopped?")
+    return AttachError(f"the server at {path} did not answer within {ANSWER_TIMEOUT_S:g} s: check that it runs")
 
 
 def _no_room(path: Path) -> str:

@@ -26,7 +26,7 @@ def program_path(name: str) -> Path:
         ValueError: `name` is not a program of the bench.
     """
     if name not in NAMES:
-        raise ValueError(f"{name!r} is not a program of the bench: {', '.join(NAMES)}")
+        raise ValueError(f"{name!r} is not a program of the bench: use one of {', '.join(NAMES)}")
     named = os.environ.get(VARIABLE)
     if named:
         path = Path(named) / name

@@ -110,7 +110,7 @@ def load_index(path: Path) -> Index:
             # Without an exchange of names, the name is free for a moment.
             if is_last or not path.parent.exists():
                 raise
-    raise ReadFailed(f"{path} is replaced by other programs while it is read")
+    raise ReadFailed(f"other programs replaced {path} while it was read: try again")
 
 
 def _read_description(path: Path) -> tuple[bytes, int, int]:

@@ -103,7 +103,7 @@ class Run:
                     if self._has_ended:
                         return
                     if not self._changed.wait(timeout) and self._count <= start and not self._has_ended:
-                        raise TimeoutError(f"no event for {timeout:g} s")
+                        raise TimeoutError(f"the bench sent no event for {timeout:g} s")
                 event = self._at(start)
             start = event.index + 1
             yield event
@@ -128,7 +128,7 @@ class Run:
                     break
                 remaining = deadline - time.monotonic()
                 if remaining <= 0:
-                    raise TimeoutError(f"{what}: no answer for {timeout:g} s")
+                    raise TimeoutError(f"{what}: the bench did not answer for {timeout:g} s")
                 self._changed.wait(remaining)
         raise self.failure()
 

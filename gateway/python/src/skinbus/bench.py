@@ -118,7 +118,7 @@ class Bench:
             RuntimeError: The bench was started before.
         """
         if self._run is not None:
-            raise RuntimeError("the bench was started before: make another one")
+            raise RuntimeError("this bench was already started: create another one")
         program = program_path("skinbus")
         environment, descriptors = dict(os.environ), []
         try:
@@ -232,7 +232,7 @@ class Bench:
             buses, node = list(self.ready.buses), int(cell)
         names = [f"{one.bus}:{node}" for one in buses if node in one.cells]
         if len(names) != 1:
-            why = f"one of {', '.join(names)}?" if names else "the skin does not have it"
+            why = f"several buses have it: use one of {', '.join(names)}" if names else "the skin has no such cell"
             raise ValueError(f"cell {cell}: {why}")
         return names[0]
 
@@ -365,7 +365,7 @@ class Bench:
         if bus is not None:
             return bus
         if len(self.ready.buses) != 1:
-            raise ValueError(f"which bus: {', '.join(one.bus for one in self.ready.buses)}?")
+            raise ValueError(f"the bus is missing: name one of {', '.join(one.bus for one in self.ready.buses)}")
         return self.ready.buses[0].bus
 
     # State and events

@@ -292,8 +292,8 @@ class SkinbusBus(can.BusABC):
                     self._raise_ended(error)
                 if wait is not None and wait <= 0:
                     raise can.CanTimeoutError(
-                        f"{self.channel}: the server at {self._path} made no room for a frame within {timeout:g} s: is "
-                        "it stopped?"
+                        f"{self.channel}: the server at {self._path} accepted no frame within {timeout:g} s: "
+                        "check that it runs"
                     ) from None
                 if lacks_memory:
                     time.sleep(_RETRY_INTERVAL_S)

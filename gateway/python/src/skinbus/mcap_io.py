@@ -128,7 +128,7 @@ class McapReader(BinaryIOMessageReader):
         return True
 
     def _warn_cut_off(self) -> None:
-        _LOG.warning("%s: its end is missing: it is read as far as it goes", self._name)
+        _LOG.warning("%s: its end is missing: only the existing part is read", self._name)
 
 
 class _FrameChannels:
@@ -177,7 +177,7 @@ def _records_of_chunk(records: bytes) -> Iterator[tuple[int, int, int]]:
         begin = at + _RECORD_HEAD.size
         at = begin + length
         if at > len(records):
-            raise McapError("a record ends behind its chunk")
+            raise McapError("a record extends beyond its chunk")
         yield opcode, begin, at
 
 
@@ -219,7 +219,7 @@ class McapWriter(BinaryIOMessageWriter):
                     "file; `skinbus convert` reads several as one"
                 )
             if self._path.exists() and not self._path.is_file():
-                raise OSError(f"{self._path} is not a regular file: name another one")
+                raise OSError(f"{self._path} is not a regular file: name another file")
             file, self._part = _create_part(self._path)
         super().__init__(file, mode="wb")
         self._default_bus = channel

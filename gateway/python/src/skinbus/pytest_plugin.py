@@ -136,12 +136,12 @@ def _arguments(request: pytest.FixtureRequest) -> dict[str, Any]:
         named = request.config.getini("skinbus_skin")
         if not named:
             raise pytest.UsageError(
-                f'{request.node.nodeid}: which skin? Mark the test with @pytest.mark.skin("skin.toml"), or set '
+                f'{request.node.nodeid}: the test has no skin: mark it with @pytest.mark.skin("skin.toml"), or set '
                 "skinbus_skin in the configuration file of pytest"
             )
         return {"skin": _configuration_folder(request.config) / named}
     if len(marker.args) != 1:
-        raise pytest.UsageError(f"{request.node.nodeid}: the marker `skin` needs one path, of a skin")
+        raise pytest.UsageError(f"{request.node.nodeid}: the marker `skin` needs one argument, the path of a skin file")
     return _relative({"skin": marker.args[0], **marker.kwargs}, request.path.parent)
 
 

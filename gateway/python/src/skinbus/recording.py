@@ -346,7 +346,7 @@ class Recording:
         buses = sorted({cell.bus for cell in self.cells})
         if len(buses) == 1:
             return self._bus_index(buses[0])
-        raise ValueError(f"name the bus: cells are on {', '.join(buses)}")
+        raise ValueError(f"several buses have cells: name one of {', '.join(buses)}")
 
     def _cell(self, cell: CellName) -> tuple[int, int]:
         """Returns the bus and the node id of a cell."""
