@@ -41,7 +41,10 @@ pub enum SensingError {
     #[error(transparent)]
     Bus(#[from] BusError),
     /// No cell answered.
-    #[error("no answer from {who} on {bus}: start the cell, or give the bus's format with --format {other}")]
+    #[error(
+        "{who} on {bus} sent no answer: start the cell, or give the frame format of the bus with --format \
+         {other}"
+    )]
     NoAnswer {
         /// Description of the addressed cells.
         who: String,
@@ -63,9 +66,7 @@ pub enum SensingError {
         reason: i16,
     },
     /// Some cells are present but did not answer.
-    #[error(
-        "{cells} on {bus} did not answer, but {done} did: repeat the command for the others when they send again"
-    )]
+    #[error("{cells} on {bus} did not answer, but {done} did: repeat the command when the others send again")]
     Silent {
         /// The cells as text.
         cells: String,
@@ -195,7 +196,7 @@ mod tests {
         }
         assert!(!have_all_cells_answered(&answers, None, true));
         assert_eq!(answers.missing_cells(), [cell(3)].into(), "the answer to another sender does not count");
-        let why = "cell 3 on vcan0 did not answer, but 2 did: repeat the command for the others when they send again";
+        let why = "cell 3 on vcan0 did not answer, but 2 did: repeat the command when the others send again";
         assert_eq!(says(&answers, None), Err(why.to_owned()));
         answers.record_message(&confirms(3, SENSING_REQUEST_TAG));
         assert!(
@@ -210,8 +211,8 @@ mod tests {
         let mut answers = ReceivedAnswers::new(only, Some(SENSING_REQUEST_TAG));
         answers.record_message(&confirms(1, SENSING_REQUEST_TAG));
         assert_eq!(answers.missing_cells(), [cell(7)].into());
-        let why =
-            "no answer from cell 7 on vcan0: start the cell, or give the bus's format with --format classic";
+        let why = "cell 7 on vcan0 sent no answer: start the cell, or give the frame format of the bus with \
+             --format classic";
         assert_eq!(says(&answers, only), Err(why.to_owned()));
         answers.record_message(&confirms(7, SENSING_REQUEST_TAG));
         assert!(have_all_cells_answered(&answers, only, false));

@@ -137,7 +137,7 @@ impl Summary {
     fn lost_buses(&self) -> Option<String> {
         let lost: Vec<_> = self.buses.iter().filter(|bus| bus.outages.at_end).collect();
         let names = || lost.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
-        (!lost.is_empty()).then(|| format!("these buses were still lost when the run ended: {}", names()))
+        (!lost.is_empty()).then(|| format!("these buses did not work when the run ended: {}", names()))
     }
 
     fn lost_frames(&self) -> Option<String> {

@@ -99,8 +99,8 @@ pub enum Refusal {
     },
     /// The motion is known for too few broadcasts.
     #[error(
-        "{bus}: {disturbance}, so that too few remain for a calibration; make a longer recording, in which \
-         the control loop skips no ticks"
+        "{bus}: {disturbance}; too few broadcasts remain for a calibration: make a longer recording, in \
+         which the control loop skips no ticks"
     )]
     Disturbed {
         /// The bus.

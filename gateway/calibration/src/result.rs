@@ -191,10 +191,13 @@ impl core::fmt::Display for Diagnosis {
                 )
             }
             Self::Swapped { node } => {
-                write!(f, "swapped with node {node}: each cell is where the skin describes the other")
+                write!(
+                    f,
+                    "swapped with node {node}: each of the two cells is mounted where the skin places the other"
+                )
             }
             Self::Elsewhere { node } => {
-                write!(f, "at a wrong place: it is where the skin describes node {node}")
+                write!(f, "in a wrong place: it is mounted where the skin places node {node}")
             }
             Self::NotObservable { position_mm, orientation_deg, help } => write!(
                 f,

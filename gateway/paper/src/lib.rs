@@ -101,17 +101,21 @@ impl Experiment {
             }
             Self::Fig10 => (
                 "fig10",
-                "time of the central computation by active cells (Eq. 30, 31), maximum number of cells at 500 Hz",
+                "time of the central computation by number of active cells (Eq. 30, 31); maximum number of \
+                 cells at 500 Hz",
                 [1, 4],
             ),
             Self::Distributed => (
                 "distributed",
-                "time of the loop's ticks by number of cells and of active cells, and of receiving torques",
+                "time of the loop's ticks by number of cells and of active cells; time to receive a torque",
                 [1, 20],
             ),
-            Self::Sums => {
-                ("sums", "error of summed torques by active cells: truncated, rounded, carried", [1, 10])
-            }
+            Self::Sums => (
+                "sums",
+                "error of summed torques by number of active cells: truncated, rounded, or with the \
+                          rounding error carried over",
+                [1, 10],
+            ),
             Self::Sine => ("sine", "error of the 16-bit sine functions over the whole circle", [1, 1]),
             Self::Kernels => {
                 ("kernels", "operations to compute the Jacobian of one cell, with both kernels", [1, 1])
@@ -119,7 +123,8 @@ impl Experiment {
             Self::Load => ("load", "bus load by number of cells, for common bit rates", [1, 1]),
             Self::Scale => (
                 "scale",
-                "whole benches of 253 to 10 000 cells: start, processor, memory, ticks, lateness, replies in time",
+                "whole benches of 253 to 10 000 cells: start time, use of processor and memory, ticks, \
+                 replies in time",
                 [8, 150],
             ),
         }

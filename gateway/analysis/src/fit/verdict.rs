@@ -92,7 +92,7 @@ impl AnsweringCells {
 impl Display for AnsweringCells {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         match *self {
-            Self::All { cells: 1 } => f.write_str("the only cell answers"),
+            Self::All { cells: 1 } => f.write_str("1 cell answers"),
             Self::All { cells } => write!(f, "all {cells} cells answer"),
             Self::Some { most, cells, described: true } => {
                 write!(f, "at most {most} of {cells} cells answered")
@@ -100,7 +100,7 @@ impl Display for AnsweringCells {
             Self::Some { most, cells, described: false } => {
                 write!(f, "at most {most} of {cells} observed cells answered")
             }
-            Self::Foreign => f.write_str("another protocol"),
+            Self::Foreign => f.write_str("frames of another protocol"),
         }
     }
 }

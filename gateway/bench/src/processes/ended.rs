@@ -53,7 +53,7 @@ impl EndedProcesses {
                 let known = self.errors.contains_key(&why);
                 let cells = self.errors.entry(why).or_default().entry(bus.to_owned()).or_default();
                 cells.extend(group.iter().flat_map(|ended| ended.nodes.0..=ended.nodes.1));
-                if known { format!("{status}; the reason is given above") } else { how.to_owned() }
+                if known { format!("{status}; for the reason see above") } else { how.to_owned() }
             },
         );
         match group {

@@ -148,9 +148,9 @@ fn sum_text(cell: CellId, epoch: Epoch, own: &OwnContribution, units: BusUnits) 
     let sum = Message::Sum { from: cell, epoch, torque: own.sum, count: own.count };
     let children: Vec<_> = own.children.iter().map(ToString::to_string).collect();
     let less = match children.as_slice() {
-        [] => "no children".to_owned(),
-        [one] => format!("minus its child {one}"),
-        several => format!("minus its children {}", several.join(", ")),
+        [] => "without children".to_owned(),
+        [one] => format!("without its child {one}"),
+        several => format!("without its children {}", several.join(", ")),
     };
     let word = |(joint, step): (usize, &Option<i32>)| match (step, units.torque_unit(joint)) {
         (None, _) => " saturated".to_owned(),

@@ -78,13 +78,14 @@ pub enum ReplayError {
     Kinds(#[from] KindsError),
     /// Standard input cannot be read twice.
     #[error(
-        "a replay reads its capture twice, which is impossible with standard input: save the capture to a file, and \
-         name that file"
+        "a replay reads its input twice, which is impossible with standard input: save the frames to a file, \
+         and name that file"
     )]
     StandardInput,
     /// A pipe cannot be read twice.
     #[error(
-        "{} is not a regular file, but a replay reads its capture twice: save the capture to a file, and name it",
+        "{} is not a regular file, but a replay reads its input twice: save the frames to a file, and name \
+         that file",
         .0.display()
     )]
     Pipe(PathBuf),
@@ -107,7 +108,7 @@ pub enum ReplayError {
     #[error("{0}; or start fresh cells on an embedded bus with --spawn")]
     BusAbsent(BusError),
     /// The requested part has nothing to send.
-    #[error("--from and --to select no frames to send: {name} ends at {ends_s:.3} s")]
+    #[error("there are no frames to send between --from and --to: {name} ends at {ends_s:.3} s")]
     NothingLeft {
         /// Display name of the capture.
         name: String,

@@ -98,7 +98,7 @@ impl PlayerBackend for LiveBackend {
             if self.down.insert(index) {
                 self.shared_state.comparator().mark_down(index);
                 self.notify(format!(
-                    "{error}; frames that are due before the bus works again are lost and counted"
+                    "{error}; until the bus works again, its frames are not sent, only counted as lost"
                 ));
             }
             // At a timed pace, waiting for answers would delay the next frames.

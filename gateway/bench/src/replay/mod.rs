@@ -127,7 +127,8 @@ pub fn replay(options: &ReplayOptions) -> Result<Summary, ReplayError> {
     let other = assumed.other();
     let progress = Progress::notes_only(options.quiet);
     progress.print_note(&format!(
-        "{} does not state the sine of its cells, and {assumed} gives different torques: replaying it again with {other}",
+        "{} does not say which sine function its cells used, and {assumed} gives other torques: the replay \
+         is repeated with {other}",
         first.file
     ));
     let (second, _) = replay_with_sine(options, Some(other))?;
@@ -239,8 +240,8 @@ fn survey_capture(
     if let Some((frame, nanos)) = backwards.filter(|(_, nanos)| *nanos > trace::order::REORDER_WINDOW_NS) {
         let back = Duration::from_nanos(nanos).as_secs_f64();
         note(format!(
-            "time stamps go backwards (first at frame {frame}, by {back:.3} s): frames that are out of order are sent \
-             immediately"
+            "time stamps go backwards (first at frame {frame}, by {back:.3} s): a frame that is out of order \
+             is sent immediately"
         ));
     }
     if survey.frames == 0 {
@@ -263,8 +264,8 @@ fn warn_of_duplicates(checks: &CellChecks, heard: &[BTreeSet<CellId>], progress:
         let both: Vec<_> = heard.iter().copied().filter(|cell| bus.cells.contains_key(cell)).collect();
         if !both.is_empty() {
             progress.print_note(&format!(
-                "these cells on {name} will receive copies of their own frames from the capture: {}; use --only inputs \
-                 to omit these frames",
+                "the replay also sends recorded frames of these cells on {name}, although the cells are on \
+                 the bus: {}; add --only inputs to leave such frames out",
                 format_cells(&both, "")
             ));
         }

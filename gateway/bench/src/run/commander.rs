@@ -97,19 +97,19 @@ pub(super) enum CommandError {
     NoProcess,
     #[error("the process {}", phase_text(*.0))]
     Phase(Phase),
-    #[error("the skin has no wire between them")]
+    #[error("the skin has no wire between these cells")]
     NoWire,
     #[error("the cells of this bus send torques, not sums, so they do not use links")]
     NoLinks,
-    #[error("it is already down")]
+    #[error("the bus is already down")]
     AlreadyDown,
-    #[error("no command has taken it down")]
+    #[error("only a bus that a command took down can be brought up")]
     NotTakenDown,
-    #[error("it was already brought up, but does not work yet")]
+    #[error("the bus was already brought up, but does not work yet")]
     ComesUp,
     #[error("another program serves this bus: stop that program")]
     NotServed,
-    #[error("it is not a virtual interface: only vcan, vxcan and embedded buses can be taken down here")]
+    #[error("the bus is not a virtual interface: only vcan, vxcan and embedded buses can be taken down here")]
     NotVirtual,
     #[error("there is no such interface")]
     NoInterface,

@@ -225,7 +225,10 @@ impl Network {
                 Ok(()) => look.messages.push(self.announce_slots(now)),
                 Err(why) if !self.reported_too_deep => {
                     self.reported_too_deep = true;
-                    look.notes.push(format!("{why}; deeper cells send too early, and their sums are late"));
+                    look.notes.push(format!(
+                        "{why}; until then, deeper cells send their sums in the wrong \
+                                             slot, and these arrive late"
+                    ));
                 }
                 Err(_) => {}
             }

@@ -310,7 +310,7 @@ impl Bench<'_> {
             for cell in cells.iter().filter_map(|&cell| options.skin.cells.get(cell)) {
                 let done = self.processes.apply_action(cell.bus, cell.node.get(), *action)?;
                 let bus = self.bus_name(cell.bus);
-                let failed = if done { "" } else { ": this run did not start its process" };
+                let failed = if done { "" } else { ", ignored because this run did not start its process" };
                 progress.print_note(&format!("scenario: {action:?} cell {} on {bus}{failed}", cell.node));
             }
         }

@@ -100,10 +100,10 @@ pub fn cells_in_error(errors: &[CellError], with_reasons: bool) -> Option<String
         false => error.names(),
     });
     let each = each.collect::<Vec<_>>().join("; ");
-    let above = if with_reasons { "" } else { ", given above" };
+    let above = if with_reasons { "" } else { " (see above)" };
     let more = match errors.len().saturating_sub(MAX_REASONS) {
         0 => String::new(),
-        more => format!("; {more} more reasons are in --summary FILE"),
+        more => format!("; add --summary FILE to see the other {more} reasons"),
     };
     let all = match errors.iter().map(CellError::count).sum() {
         0_usize => return None,
@@ -236,12 +236,12 @@ mod tests {
         assert_eq!(cells_in_error(&one, true).unwrap(), "1 cell ended with an error: 7 on vcan0 (a)");
         assert_eq!(
             cells_in_error(&one, false).unwrap(),
-            "1 cell ended with an error, given above: 7 on vcan0"
+            "1 cell ended with an error (see above): 7 on vcan0"
         );
         let many: Vec<_> = (1..=252).map(|node| error(&format!("reason {node}"), &[node])).collect();
         let line = cells_in_error(&many, true).unwrap();
         assert!(line.starts_with("252 cells ended with errors: 1 on vcan0 (reason 1); "), "{line}");
-        assert!(line.ends_with("; 248 more reasons are in --summary FILE"), "{line}");
+        assert!(line.ends_with("; add --summary FILE to see the other 248 reasons"), "{line}");
         assert!(line.len() < 300, "{line}");
     }
 }

@@ -154,7 +154,7 @@ fn what_is_not_ours_is_named_and_stays_as_it_is() {
     drop(claimed.unwrap());
     assert_eq!(all(), before, "{said:?}");
     let reason = |name: &str| {
-        let begin = format!("{name}.mcap.part is left alone: ");
+        let begin = format!("{name}.mcap.part was neither repaired nor removed: ");
         let mut lines = said.iter().filter_map(|line| line.strip_prefix(&begin));
         let why = lines.next().unwrap_or_else(|| panic!("{name}: {said:?}"));
         assert_eq!(lines.next(), None);
@@ -185,7 +185,9 @@ fn a_file_that_takes_a_name_meanwhile_keeps_it() {
     let (part, _file) = PartFile::create(goal.clone()).unwrap();
     fs::remove_file(&part.path).unwrap();
     fs::write(&part.path, "somebody's").unwrap();
-    assert!(part.finish(true).unwrap_err().to_string().ends_with("run.mcap.part now names another file"));
+    assert!(
+        part.finish(true).unwrap_err().to_string().ends_with("another program has replaced run.mcap.part")
+    );
     assert!(part.open().is_err());
     part.remove();
     assert_eq!(fs::read(&part.path).unwrap(), b"somebody's");

@@ -39,11 +39,11 @@ fn summary(bus: BusSummary, cells: Vec<CellSummary>) -> Summary {
         skin: "two-cells".to_owned(),
         verdict: Verdict {
             well: false,
-            look_at: vec!["the run failed: these buses were still lost when the run ended: vcan0".to_owned()],
+            look_at: vec!["the run failed: these buses did not work when the run ended: vcan0".to_owned()],
         },
         cells,
         outcome: Outcome::Failed,
-        failure: Some("these buses were still lost when the run ended: vcan0".to_owned()),
+        failure: Some("these buses did not work when the run ended: vcan0".to_owned()),
         duration_s: 1.0,
         interrupted: false,
         halted: Some("a halt frame was received".to_owned()),

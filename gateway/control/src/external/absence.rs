@@ -64,8 +64,10 @@ pub struct OtherDatagrams {
 impl Display for OtherDatagrams {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let datagrams = |count| format!("{count} datagram{}", if count == 1 { "" } else { "s" });
-        let named = |count| format!("{} without a hello of this version", datagrams(count));
-        let unnamed = |count| format!("{} from a socket without an address: bind it", datagrams(count));
+        let named = |count| format!("{} received, but none is a hello of this version", datagrams(count));
+        let unnamed = |count| {
+            format!("{} received from a socket without an address: bind the socket", datagrams(count))
+        };
         match (self.named, self.unnamed) {
             (0, 0) => Ok(()),
             (count, 0) => write!(f, " ({})", named(count)),

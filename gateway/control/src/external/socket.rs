@@ -39,19 +39,19 @@ pub struct ExternalController {
 #[non_exhaustive]
 pub enum SocketError {
     /// Another program listens on this socket.
-    #[error("{}: another program listens on this socket; stop it, or choose another path", path.display())]
+    #[error("another program listens on the socket {}; stop it, or choose another path", path.display())]
     Live {
         /// Path of the socket.
         path: PathBuf,
     },
     /// There is a file at the path, but it is not a socket.
-    #[error("{}: exists and is not a socket, so it was left unchanged; choose another path", path.display())]
+    #[error("{} exists and is not a socket, so it was left unchanged; choose another path", path.display())]
     NotASocket {
         /// Path of the socket.
         path: PathBuf,
     },
     /// The file system gives the socket other permissions than read and write for its user only.
-    #[error("{}: the socket has mode {mode:04o} instead of 0600, so other users may connect; choose a path on another file system", path.display())]
+    #[error("the socket {} has mode {mode:04o} instead of 0600, so other users may connect; choose a path on another file system", path.display())]
     Mode {
         /// Path of the socket.
         path: PathBuf,
@@ -59,7 +59,7 @@ pub enum SocketError {
         mode: u32,
     },
     /// The system refuses the operation.
-    #[error("{}: cannot listen on this socket", path.display())]
+    #[error("cannot listen on the socket {}", path.display())]
     System {
         /// Path of the socket.
         path: PathBuf,

@@ -289,10 +289,9 @@ fn a_flood_takes_no_more_than_its_share_of_a_tick() {
 fn a_socket_is_replaced_when_dead_refused_when_live_and_removed_at_the_end() {
     let (folder, path, gateway) = gateway();
     let error = listen(&path).unwrap_err().to_string();
-    assert!(
-        error.ends_with("another program listens on this socket; stop it, or choose another path"),
-        "{error}"
-    );
+    let expected =
+        format!("another program listens on the socket {}; stop it, or choose another path", path.display());
+    assert_eq!(error, expected);
     drop(gateway);
     assert!(!path.exists());
     drop(UnixDatagram::bind(&path).unwrap());
@@ -306,7 +305,8 @@ fn a_socket_is_replaced_when_dead_refused_when_live_and_removed_at_the_end() {
     );
     assert_eq!(std::fs::read_to_string(&path).unwrap(), "notes");
     let nowhere = folder.path().join("none/controller.sock");
-    assert!(listen(&nowhere).unwrap_err().to_string().ends_with("cannot listen on this socket"));
+    let expected = format!("cannot listen on the socket {}", nowhere.display());
+    assert_eq!(listen(&nowhere).unwrap_err().to_string(), expected);
 }
 
 #[test]
@@ -376,10 +376,10 @@ fn a_controller_that_never_says_hello_is_absent_whatever_else_comes() {
     program.send(&of_another_version).unwrap();
     program.send(&velocity(0, 0.5)).unwrap();
     gateway.step(&input(1));
-    absent(&gateway, &path, None, " (2 datagrams without a hello of this version): start it");
+    absent(&gateway, &path, None, " (2 datagrams received, but none is a hello of this version): start it");
     UnixDatagram::unbound().unwrap().send_to(HELLO, &path).unwrap();
     gateway.step(&input(2));
-    absent(&gateway, &path, Some(25), ", 1 datagram from a socket without an address");
+    absent(&gateway, &path, Some(25), ", 1 datagram received from a socket without an address");
 }
 
 #[test]

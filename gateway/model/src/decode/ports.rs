@@ -40,8 +40,8 @@ pub(super) fn write_neighbors(
             number => write!(f, "{number}")?,
         }
         f.write_str(match (part("other_version"), part("works")) {
-            (1, _) => " (other version)",
-            (_, 0) => " (one way)",
+            (1, _) => " (other protocol version)",
+            (_, 0) => " (one direction only)",
             _ => "",
         })?;
     }

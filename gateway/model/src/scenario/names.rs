@@ -68,7 +68,7 @@ impl<'a> NameTable<'a> {
             None => {
                 let first = self.bus_name(0);
                 let why = format_args!(
-                    "name a bus, of {}; or name each cell with its bus, as in \"{first}:1\"",
+                    "missing: give the bus ({}), or name each cell with its bus, as in \"{first}:1\"",
                     self.bus_names_text()
                 );
                 Err(at.fault("", why))
@@ -259,7 +259,8 @@ mod tests {
 
     #[test]
     fn a_cell_that_is_not_there_is_named_beside_those_that_are() {
-        let which = "name a bus, of \"vcan0\", \"vcan1\"; or name each cell with its bus, as in \"vcan0:1\"";
+        let which =
+            "missing: give the bus (\"vcan0\", \"vcan1\"), or name each cell with its bus, as in \"vcan0:1\"";
         for (keys, said) in [
             (
                 "cells = [\"vcan0:9\"]",

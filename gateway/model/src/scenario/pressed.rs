@@ -125,7 +125,8 @@ fn check_force(at: &KeyPath, force_n: f64) -> Checked<()> {
     if (0.0..=MAX_FORCE_N).contains(&force_n) {
         return Ok(());
     }
-    let why = format!("must be 0 to {MAX_FORCE_N:.3} N, what a cell's three contact sensors can report");
+    let why =
+        format!("must be 0 to {MAX_FORCE_N:.3} N, the most that a cell's three contact sensors can report");
     Err(at.fault(force_n, why))
 }
 

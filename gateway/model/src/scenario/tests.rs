@@ -259,7 +259,8 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("force_n = 3.0", "force_n = 96.0"),
-        "s.toml:23: touch[0].force_n = 96: must be 0 to 95.997 N, what a cell's three contact sensors can report"
+        "s.toml:23: touch[0].force_n = 96: must be 0 to 95.997 N, the most that a cell's three contact \
+         sensors can report"
     );
     assert_eq!(
         says("\"step\"", "\"poke\""),
@@ -306,7 +307,8 @@ fn with_several_buses_the_bus_must_be_named() {
     let text = "version = 1\nduration_s = 1.0\n[[fault]]\nat_s = 0.5\nkind = \"kill\"\ncells = [1]\n";
     assert_eq!(
         by_line(Scenario::parse("s.toml", text, &skin).unwrap_err()),
-        "s.toml:3: fault[0].bus: name a bus, of \"vcan0\", \"vcan1\"; or name each cell with its bus, as in \"vcan0:1\""
+        "s.toml:3: fault[0].bus: missing: give the bus (\"vcan0\", \"vcan1\"), or name each cell with its \
+         bus, as in \"vcan0:1\""
     );
     let text = format!("{text}bus = \"vcan1\"\n");
     assert_eq!(

@@ -22,10 +22,10 @@ use super::{CaptureFormat, RecordingExtras};
 #[non_exhaustive]
 pub enum PartsError {
     /// The list of files is empty.
-    #[error("no file is named: name a capture")]
+    #[error("no file is given: name a candump log or an MCAP recording")]
     None,
     /// One file is a part of a recording, and another is not.
-    #[error("{} is a part of a recording, but {} is not: name only the parts", .part.display(), .other.display())]
+    #[error("{} is one part of a split recording, but {} is not a part of it: name only parts of that recording", .part.display(), .other.display())]
     Mixed {
         /// The part.
         part: PathBuf,
@@ -33,7 +33,7 @@ pub enum PartsError {
         other: PathBuf,
     },
     /// The list contains both a log and a recording.
-    #[error("{} is a candump log, and {} an MCAP recording: convert the recording to a log first with `skinbus convert`", .log.display(), .mcap.display())]
+    #[error("{} is a candump log, but {} is an MCAP recording: convert the recording to a log first with `skinbus convert`", .log.display(), .mcap.display())]
     Formats {
         /// The log.
         log: PathBuf,
@@ -41,17 +41,18 @@ pub enum PartsError {
         mcap: PathBuf,
     },
     /// One file is text without frames.
-    #[error("{} contains no frames: name only captures", .0.display())]
+    #[error("{} contains no CAN frames: leave it out, or name a candump log or an MCAP recording instead", .0.display())]
     NoFrame(PathBuf),
     /// One file is listed twice.
-    #[error("{} is named twice: name it once", .0.display())]
+    #[error("the file {} is named twice: name it once", .0.display())]
     Same(PathBuf),
     /// Standard input (`-`) is listed together with other files.
-    #[error("- (standard input) cannot be combined with other files: name only files")]
+    #[error("standard input (-) cannot be combined with other files: name only files")]
     StandardInput,
     /// Two parts belong to different recordings.
     #[error(
-        "{} and {} belong to different recordings, begun at {} and {} ns: name the parts of one recording",
+        "{} and {} belong to different recordings, which began at {} and {} ns: name only the parts of one \
+         recording",
         .one.path.display(), .other.path.display(), .one.began, .other.began
     )]
     Different {
@@ -62,7 +63,7 @@ pub enum PartsError {
     },
     /// Two files have the same part number of the same recording.
     #[error(
-        "{} and {} are both part {} of the recording: name one of them",
+        "{} and {} are both part {} of the recording: name only one of them",
         .one.path.display(), .other.path.display(), .one.number
     )]
     Twice {

@@ -49,7 +49,7 @@ impl SeekIndex {
     fn index_file(&mut self, path: &Path) -> io::Result<()> {
         let mut file = input::open(path)?;
         if !file.metadata()?.is_file() {
-            let why = "it is not a regular file, and not seekable: write it to a file first";
+            let why = "it is a stream in which this command cannot jump back: save it to a file first";
             return Err(io::Error::new(io::ErrorKind::NotSeekable, why));
         }
         self.parts.push(IndexedFile { path: path.to_owned(), descriptions: Vec::new() });

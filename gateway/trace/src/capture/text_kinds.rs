@@ -23,12 +23,15 @@ pub(super) fn detect_text_kind(text: &[u8]) -> Option<(&'static str, &'static st
         (begins_with("***BUSMASTER"), ("a BUSMASTER log", EXPORT_ADVICE)),
         (
             any(&|line| SKIN_TABLES.iter().any(|table| line.starts_with(table))),
-            (SKIN_OR_SCENARIO, "it contains no frames: name a capture"),
+            (SKIN_OR_SCENARIO, "it contains no CAN frames: name a candump log or an MCAP recording"),
         ),
         (
             any(&|line| line == "BS_:" || line == "NS_ :" || line == "NS_:" || line.starts_with("BO_ "))
                 || begins_with("VERSION \""),
-            ("a DBC file", "it describes signals and contains no frames: name a capture"),
+            (
+                "a DBC file",
+                "it describes signals and contains no CAN frames: name a candump log or an MCAP recording",
+            ),
         ),
         (any(&|line| line.starts_with("base hex") || line.starts_with("base dec")), ASC_KIND),
         (any(&|line| line.starts_with("Begin Triggerblock") || line == "// version 7.0.0"), ASC_KIND),

@@ -78,7 +78,8 @@ impl TimeChecks {
     pub(super) fn backwards_remark(&self) -> Option<String> {
         let (times, first) = self.backwards?;
         Some(format!(
-            "the time runs backwards {times} times, first at frame {first}; the order of the frames is kept"
+            "the time stamps go backwards {times} times, first at frame {first}; the order of the frames is \
+             kept"
         ))
     }
 
@@ -86,13 +87,15 @@ impl TimeChecks {
     pub(super) fn remarks(&self) -> impl Iterator<Item = String> {
         let overlap = self.overlap.as_ref().map(|(file, before)| {
             format!(
-                "{file} begins before {before} ends: they are read one after the other, not in the order of their times"
+                "{file} begins before {before} ends: the files are read one after the other, so their frames \
+                 are not in the order of time"
             )
         });
         let constant = self.buses.iter().filter(|bus| !bus.has_several && bus.frames >= MIN_CONSTANT_FRAMES);
         let constant = constant.map(|BusTimes { name, first, frames, .. }| {
             format!(
-                "all {frames} frames of {name} have the time {}: rates, gaps and loads mean nothing",
+                "all {frames} frames of {name} have the same time, {}: rates, gaps and bus loads are \
+                 meaningless",
                 DisplayedSeconds(*first)
             )
         });
@@ -126,14 +129,14 @@ mod tests {
         assert_eq!(remarks(&[("a", 5), ("a", 5), ("a", 6)]), nothing);
         assert_eq!(
             remarks(&[("a", 0), ("b", 1), ("a", 0), ("b", 2), ("a", 0)]),
-            ["all 3 frames of a have the time 0.000000000: rates, gaps and loads mean nothing"]
+            ["all 3 frames of a have the same time, 0.000000000: rates, gaps and bus loads are meaningless"]
         );
     }
 
     #[test]
     fn times_that_run_backwards_are_counted_by_bus() {
         let backwards =
-            ["the time runs backwards 1 times, first at frame 3; the order of the frames is kept"];
+            ["the time stamps go backwards 1 times, first at frame 3; the order of the frames is kept"];
         assert_eq!(remarks(&[("a", 5), ("b", 1), ("a", 4), ("b", 2)]), backwards);
     }
 }

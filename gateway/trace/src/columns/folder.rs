@@ -141,10 +141,10 @@ pub fn check_columns_writable(path: &Path, overwrite: bool) -> io::Result<()> {
     };
     let refused = |why: String| Err(io::Error::new(io::ErrorKind::AlreadyExists, why));
     if !kind.is_dir() {
-        return refused("it is not a folder of columns: name another one".to_owned());
+        return refused("it exists and is not a folder of columns: name another folder".to_owned());
     }
     if !has_description(path) {
-        return refused("it is a folder of other files: name another one".to_owned());
+        return refused("the folder contains other files: name another folder".to_owned());
     }
     if !overwrite {
         return Err(exists_error());
@@ -153,7 +153,8 @@ pub fn check_columns_writable(path: &Path, overwrite: bool) -> io::Result<()> {
         let name = entry?.file_name();
         if !is_column_file(Path::new(&name)) {
             return refused(format!(
-                "it contains {}, which is not one of its columns: move that away, or name another folder",
+                "the folder contains {}, which is not a column file: move that file away, or name another \
+                 folder",
                 name.display()
             ));
         }
@@ -180,8 +181,9 @@ fn remove_left_part(part: &Path) -> io::Result<()> {
         return Ok(());
     }
     let name = part.display();
-    let why =
-        format!("{name} exists, and no killed conversion has left it: move it away, or name another folder");
+    let why = format!(
+        "{name} exists, but was not left by an interrupted conversion: move it away, or name another folder"
+    );
     Err(io::Error::new(io::ErrorKind::AlreadyExists, why))
 }
 

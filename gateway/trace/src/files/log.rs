@@ -145,12 +145,13 @@ impl LogFile {
         let Ok(about) = file.metadata() else { return Ok(()) };
         let (bytes, written) = (about.len(), self.bytes);
         let why = if still_names_file(&self.path, device_and_inode(&about)) == Some(false) {
-            "another program renamed, removed or replaced it while it was written; further data goes to the file \
-             that was opened"
+            "another program renamed, removed or replaced the file while it was being written; further data \
+             still goes to the original file"
                 .to_owned()
         } else if bytes != written {
             format!(
-                "another program changed it while it was written: it has {bytes} bytes, but {written} were written"
+                "another program changed the file while it was being written: it has {bytes} bytes, but \
+                 {written} were written"
             )
         } else {
             return Ok(());
@@ -231,7 +232,7 @@ fn create_locked(path: &Path) -> io::Result<File> {
 /// Locks a log against other writers. Succeeds on file systems that do not support locks.
 fn lock_log(file: &File) -> io::Result<()> {
     if lock_exclusively(file).is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock) {
-        let why = "another run is writing it: name another file, or wait for that run's end";
+        let why = "another run is writing this file: name another file, or wait until that run has ended";
         return Err(io::Error::new(io::ErrorKind::AlreadyExists, why));
     }
     Ok(())

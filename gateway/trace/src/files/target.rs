@@ -54,7 +54,8 @@ impl OutputTarget {
             } else {
                 let itself = if !force && path.exists() { " and add --overwrite" } else { "" };
                 let why = format!(
-                    "it is a symlink, which is not followed: name the file itself{itself}, or another one"
+                    "it is a symlink, which is not followed: name the file that it points to{itself}, or \
+                     another file"
                 );
                 Err(io::Error::new(io::ErrorKind::AlreadyExists, why))
             };
@@ -89,12 +90,12 @@ pub fn check_writable_regular_file(path: &Path, force: bool) -> io::Result<()> {
 }
 
 fn not_regular_file_error() -> io::Error {
-    io::Error::new(io::ErrorKind::AlreadyExists, "it is not a regular file: name another one")
+    io::Error::new(io::ErrorKind::AlreadyExists, "it is not a regular file: name another file")
 }
 
 /// Returns the error for an output file that exists already.
 pub(crate) fn exists_error() -> io::Error {
-    let why = "it exists: name another file, or overwrite it with --overwrite";
+    let why = "the file exists: name another file, or add --overwrite";
     io::Error::new(io::ErrorKind::AlreadyExists, why)
 }
 
@@ -126,7 +127,7 @@ pub(super) fn open_stream(path: &Path, stopped: &AtomicBool) -> io::Result<File>
                 if stopped.load(Ordering::Relaxed) {
                     return Err(io::Error::new(
                         io::ErrorKind::Interrupted,
-                        "interrupted: no program read it",
+                        "interrupted while it waited for a program that reads this pipe",
                     ));
                 }
                 std::thread::sleep(POLL_INTERVAL);

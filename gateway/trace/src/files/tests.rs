@@ -50,20 +50,21 @@ fn what_is_there_is_not_overwritten_and_no_symlink_is_followed_to_a_file() {
     fs::create_dir(&directory).unwrap();
     let _socket = std::os::unix::net::UnixListener::bind(&socket).unwrap();
     let before = names(folder.path());
-    let exists = "it exists: name another file, or overwrite it with --overwrite";
+    let exists = "the file exists: name another file, or add --overwrite";
     assert_eq!(refusals(&file, false), [exists; 2]);
     for force in [false, true] {
         for path in [&link, &dangling] {
             // The link's target exists, so it would be refused as well.
             let itself = if path == &link && !force { " and add --overwrite" } else { "" };
             let why = format!(
-                "it is a symlink, which is not followed: name the file itself{itself}, or another one"
+                "it is a symlink, which is not followed: name the file that it points to{itself}, or another \
+                 file"
             );
             assert_eq!(refusals(path, force), [why.clone(), why]);
         }
         let why = "is a directory; name a file in a folder that can be written";
         assert_eq!(refusals(&directory, force), [why; 2]);
-        assert_eq!(refusals(&socket, force), ["it is not a regular file: name another one"; 2]);
+        assert_eq!(refusals(&socket, force), ["it is not a regular file: name another file"; 2]);
     }
     assert_eq!(names(folder.path()), before);
     assert_eq!(fs::read_to_string(&file).unwrap(), "mine");
@@ -155,7 +156,7 @@ fn a_fifo_is_waited_for_until_somebody_reads_it_or_says_stop() {
     let made = rustix::fs::mknodat(CWD, &path, rustix::fs::FileType::Fifo, Mode::RWXU, 0);
     made.unwrap();
     let stopped = LogFile::create(&path, false, &AtomicBool::new(true)).unwrap_err();
-    assert_eq!(stopped.to_string(), "interrupted: no program read it");
+    assert_eq!(stopped.to_string(), "interrupted while it waited for a program that reads this pipe");
     let fifo = path.clone();
     let reader = std::thread::spawn(move || {
         BufReader::new(File::open(fifo).unwrap()).lines().map(Result::unwrap).collect::<Vec<_>>()
@@ -208,7 +209,7 @@ fn a_log_takes_another_files_place_with_its_first_line() {
 fn two_do_not_write_one_log() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("run.log");
-    let why = "another run is writing it: name another file, or wait for that run's end";
+    let why = "another run is writing this file: name another file, or wait until that run has ended";
     fs::write(&path, "old\n").unwrap();
     for force in [true, false] {
         let mut first = log(&path, force).unwrap();

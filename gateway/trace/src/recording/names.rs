@@ -94,7 +94,7 @@ pub fn keep_damaged(part: &Path, from: &File) -> io::Result<PathBuf> {
             Err(error) => return Err(error),
         }
     }
-    Err(io::Error::other("all names for a copy are already in use"))
+    Err(io::Error::other("all names that a copy could get are in use: move old copies away"))
 }
 
 /// Returns the existing files of an earlier recording under this name: the first file and the numbered ones.
@@ -135,7 +135,7 @@ impl PartFile {
     /// Returns an error if the file cannot be renamed.
     pub fn finish(&self, force: bool) -> io::Result<()> {
         if !self.has_temporary_name() {
-            return Err(io::Error::other(format!("{} now names another file", self.path.display())));
+            return Err(io::Error::other(format!("another program has replaced {}", self.path.display())));
         }
         rename(&self.path, &self.goal, force)
     }
@@ -161,7 +161,7 @@ impl PartFile {
     pub fn open(&self) -> io::Result<File> {
         let file = open_no_follow(&self.path)?;
         if device_and_inode(&file.metadata()?) != self.identity {
-            return Err(io::Error::other("the name now belongs to another file"));
+            return Err(io::Error::other("another program has put a different file under this name"));
         }
         Ok(file)
     }
@@ -169,7 +169,7 @@ impl PartFile {
 
 /// Returns the error message for a recording whose name another program took while it was written.
 pub(super) fn name_conflict_message(goal: &Path) -> String {
-    format!("{}: another program has created a file of this name in the meantime", goal.display())
+    format!("{}: another program has meanwhile created a file with this name", goal.display())
 }
 
 /// Returns the error message for a recording whose name is already in use.
@@ -183,7 +183,7 @@ fn name_in_use_message(path: &Path) -> String {
         Ok(file) if !is_locked(&file) => format!(
             "{name} exists, but was not left by a killed run: move it away, or record to another name"
         ),
-        _ => format!("{name} exists: another run is recording to this name: record to another name"),
+        _ => format!("{name} exists, and another run is recording to it: record to another name"),
     }
 }
 
@@ -331,7 +331,7 @@ fn check_identity(path: &Path, file: &File) -> io::Result<()> {
     if still_names_file(path, device_and_inode(&file.metadata()?)) == Some(true) {
         return Ok(());
     }
-    Err(io::Error::other("the name now belongs to another file, which was kept"))
+    Err(io::Error::other("another program has put a different file under this name, which was kept"))
 }
 
 #[cfg(test)]
@@ -359,7 +359,7 @@ mod tests {
         assert_eq!(orphans(&goal).len(), 0, "somebody writes it");
         let error = PartFile::create(goal.clone()).unwrap_err().to_string();
         assert!(
-            error.ends_with("part exists: another run is recording to this name: record to another name"),
+            error.ends_with("part exists, and another run is recording to it: record to another name"),
             "{error}"
         );
         drop(file);

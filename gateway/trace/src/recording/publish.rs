@@ -99,8 +99,9 @@ fn publish<T>(CompleteFile { file, part, about }: CompleteFile<T>, force: bool) 
             let (goal, there) = (part.goal.display(), part.path.display());
             if !part.has_temporary_name() {
                 let error = format!(
-                    "{there}: another program renamed, removed or replaced it while it was written; the recording is \
-                     complete, wherever it is now, but its contents count as lost"
+                    "{there}: another program renamed, removed or replaced this file while it was being \
+                     written; the recording is complete, but its place is unknown, so its contents count as \
+                     lost"
                 );
                 return PublishedFile { path: None, about, error: Some(error) };
             }
@@ -128,7 +129,7 @@ mod tests {
         let published = publish(CompleteFile { file, part, about: () }, false);
         let error = published.error.unwrap();
         assert!(
-            error.contains("run.mcap: another program has created a file of this name in the meantime; "),
+            error.contains("run.mcap: another program has meanwhile created a file with this name; "),
             "{error}"
         );
         assert!(error.ends_with("run.mcap.part is the complete recording: rename it"), "{error}");

@@ -81,7 +81,7 @@ impl fmt::Display for RecoveryResult {
             write!(f, ", the last at {}.{:06}", seconds.0, seconds.1)?;
         }
         match self.unfinished_bytes {
-            0 => write!(f, "; no unfinished record at the end")?,
+            0 => write!(f, "; the last record is complete")?,
             bytes => write!(f, "; {bytes} bytes of an unfinished record are lost")?,
         }
         match self.damaged {

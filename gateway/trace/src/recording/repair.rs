@@ -157,7 +157,7 @@ pub fn repair_orphans(path: &Path, mut say: impl FnMut(&str)) {
                 let hint = why.may_be_recording().then(|| {
                     format!("; if it is an unfinished recording, `skinbus recover {name} -o NAME` copies it")
                 });
-                say(&format!("{name} is left alone: {why}{}", hint.unwrap_or_default()));
+                say(&format!("{name} was neither repaired nor removed: {why}{}", hint.unwrap_or_default()));
                 continue;
             }
         };
@@ -189,7 +189,7 @@ mod tests {
         assert!(full.ends_with("run.mcap.part -o FILE`, a file on another disk"), "{full}");
         let taken = line(io::ErrorKind::AlreadyExists);
         assert!(
-            taken.contains("run.mcap: another program has created a file of this name in the meantime; "),
+            taken.contains("run.mcap: another program has meanwhile created a file with this name; "),
             "{taken}"
         );
         assert!(taken.ends_with("run.mcap.part`") && !taken.contains("--overwrite"), "{taken}");

@@ -170,8 +170,7 @@ impl<T> SplitRecording<T> {
     pub fn claim(path: &Path, force: bool, split: SplitLimits) -> io::Result<Self> {
         let stale = names::existing_files(path);
         if let Some(there) = stale.first().filter(|_| !force) {
-            let why =
-                format!("{} exists: name another file, or overwrite it with --overwrite", there.display());
+            let why = format!("the file {} exists: name another file, or add --overwrite", there.display());
             return Err(io::Error::new(io::ErrorKind::AlreadyExists, why));
         }
         Ok(Self {

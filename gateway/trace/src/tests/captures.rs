@@ -205,7 +205,7 @@ fn times_that_run_backwards_are_counted_and_keep_their_order() {
     assert_eq!(done.frames, 4);
     assert_eq!(
         backwards(log),
-        ["the time runs backwards 2 times, first at frame 2; the order of the frames is kept"]
+        ["the time stamps go backwards 2 times, first at frame 2; the order of the frames is kept"]
     );
     assert_eq!(converted(&mcap, CaptureFormat::Candump).0, log.as_bytes());
 }
@@ -217,7 +217,7 @@ fn times_of_each_bus_are_compared_with_its_own() {
     let earlier = apart.replace("(2.", "(0.");
     assert_eq!(
         backwards(&earlier),
-        ["the time runs backwards 1 times, first at frame 4; the order of the frames is kept"]
+        ["the time stamps go backwards 1 times, first at frame 4; the order of the frames is kept"]
     );
 }
 

@@ -228,7 +228,7 @@ fn read_recording(
         }
     }
     if run.is_empty() {
-        let nothing = || "it has no tick and no frame of its skin's buses".to_owned();
+        let nothing = || "it contains no ticks and no frames of the buses in its skin".to_owned();
         return Err(match damaged {
             Some(error) => error.into(),
             None => match unfinished {
@@ -305,7 +305,7 @@ impl RunData {
         let is_log = format == CaptureFormat::Candump;
         let frames_only = recorded.is_none().then(|| FramesOnlyCapture::new(is_log, skin_file));
         let Some(skin) = recorded.or_else(|| options.skin.clone().map(|(_, skin)| Ok(skin))) else {
-            let what = format!("{SKIN_ATTACHMENT} is not attached to it");
+            let what = format!("it has no attachment {SKIN_ATTACHMENT}");
             return Err(match &extras.unfinished {
                 Some(why) => {
                     ReportError::Unfinished { name: name.to_owned(), what: format!("{what} ({why})") }

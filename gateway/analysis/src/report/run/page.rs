@@ -210,7 +210,8 @@ impl PageDraft<'_> {
         findings.extend(self.fit_findings());
         let uplink: UplinkCounts =
             self.run.bus_figures.iter().map(|bus_figures| bus_figures.table.uplink()).sum();
-        let lost = zero_required_finding("lost packets of cells, by their own count".to_owned(), uplink.lost);
+        let lost =
+            zero_required_finding("lost packets, according to the cells' counters".to_owned(), uplink.lost);
         findings.push(lost.with_command(self.worst_loss_command(|loss| loss.packets)));
         findings.extend(self.stuck_cells_finding());
         Section::new("summary", "In numbers").with_findings(findings).with_paragraph(

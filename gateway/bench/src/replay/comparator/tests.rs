@@ -377,10 +377,8 @@ fn a_sum_that_differs_is_shown_with_its_children() {
     assert_eq!(counts(&comparator), [6, 6, 0, 0]);
     let text = comparator.first_difference().unwrap().text.clone();
     let expected = "the first difference: cell 1 on vcan0, joints message 0 (epoch 0, 0.007 s into the recording)
-  recorded  sum 1 epoch 0: 0.156 0.000 0.000 0.000 0.000 0.000 Nm, cells 2; minus its child 2: 0.039 0.000 0.000 \
-                    0.000 0.000 0.000 Nm
-  now       sum 1 epoch 0: 0.062 0.000 0.000 0.000 0.000 0.000 Nm, cells 1; no children: 0.062 0.000 0.000 0.000 \
-                    0.000 0.000 Nm
+  recorded  sum 1 epoch 0: 0.156 0.000 0.000 0.000 0.000 0.000 Nm, cells 2; without its child 2: 0.039 0.000 0.000 0.000 0.000 0.000 Nm
+  now       sum 1 epoch 0: 0.062 0.000 0.000 0.000 0.000 0.000 Nm, cells 1; without children: 0.062 0.000 0.000 0.000 0.000 0.000 Nm
   joint 1: 6 steps higher (0.0234 Nm)";
     assert_eq!(text, expected);
 }

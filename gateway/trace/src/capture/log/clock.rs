@@ -38,15 +38,19 @@ impl fmt::Display for LogRemark {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::NoTimes => {
-                "its lines have no time (candump without -t): frames are numbered in their order, 1 us apart; rates, \
-                 gaps and loads mean nothing"
+                "its lines have no time (candump without -t): each frame is placed 1 us after the one \
+                 before, so rates, gaps and bus loads are meaningless"
             }
-            Self::LocalTimes => "its times are dates (candump -t A) of an unknown time zone: they are read as UTC",
-            Self::SinceFirst => "its times count from the first frame (candump -t z), which is at 0",
-            Self::Differences => "its times are differences (candump -t d): they are added up from 0",
+            Self::LocalTimes => {
+                "its times are dates without a time zone (candump -t A): they are read as UTC"
+            }
+            Self::SinceFirst => "its times count from the first frame (candump -t z), not from 1970",
+            Self::Differences => {
+                "its times are differences between frames (candump -t d): they are added up, from 0"
+            }
             Self::NoFlags => {
-                "its lines do not say whether FD frames switch the bit rate (candump without -x): they are read as if \
-                 none did"
+                "its lines lack the FD flags (candump without -x): FD frames are read as frames without \
+                 bit-rate switch"
             }
         })
     }

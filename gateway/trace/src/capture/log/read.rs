@@ -307,7 +307,7 @@ pub(crate) fn frame_time_in_line(line: &[u8]) -> Option<Option<u64>> {
 /// counts as unreadable; others are text.
 #[cold]
 fn line_note(text: &[u8], long: bool, nanos: u64, line: u64) -> CaptureNote<'_> {
-    let why = format!("the line has more than {MAX_LINE_BYTES} bytes, and the rest is left out");
+    let why = format!("the line is longer than {MAX_LINE_BYTES} bytes; its rest was skipped");
     let kind = match candump::parse_bytes(text) {
         _ if long => NoteKind::Unreadable(why),
         Ok(CandumpLine::Frame(_) | CandumpLine::Other) => NoteKind::Text,
@@ -372,9 +372,8 @@ mod tests {
 
     #[test]
     fn of_a_line_without_end_the_beginning_is_kept_and_the_next_one_is_read() {
-        let long = || {
-            Err::<(), _>(format!("the line has more than {MAX_LINE_BYTES} bytes, and the rest is left out"))
-        };
+        let long =
+            || Err::<(), _>(format!("the line is longer than {MAX_LINE_BYTES} bytes; its rest was skipped"));
         for piece in [4097, READ_BYTES] {
             let mut bytes = vec![b'('; 3 * READ_BYTES];
             bytes.extend_from_slice(b"\nnext\n");

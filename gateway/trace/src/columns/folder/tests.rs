@@ -70,15 +70,16 @@ fn only_a_folder_of_columns_is_replaced() {
     let path = place.path().join("run.columns");
     let refused = |path: &Path, overwrite| check_columns_writable(path, overwrite).unwrap_err().to_string();
     fs::create_dir(&path).unwrap();
-    assert_eq!(refused(&path, true), "it is a folder of other files: name another one");
+    assert_eq!(refused(&path, true), "the folder contains other files: name another folder");
     fs::write(path.join(DESCRIPTION_FILE), "{\"other\": 1}").unwrap();
-    assert_eq!(refused(&path, true), "it is a folder of other files: name another one");
+    assert_eq!(refused(&path, true), "the folder contains other files: name another folder");
     fs::write(path.join(DESCRIPTION_FILE), DESCRIPTION).unwrap();
-    assert_eq!(refused(&path, false), "it exists: name another file, or overwrite it with --overwrite");
+    assert_eq!(refused(&path, false), "the file exists: name another file, or add --overwrite");
     fs::write(path.join("thesis.txt"), "mine").unwrap();
     assert_eq!(
         refused(&path, true),
-        "it contains thesis.txt, which is not one of its columns: move that away, or name another folder"
+        "the folder contains thesis.txt, which is not a column file: move that file away, or name another \
+         folder"
     );
     fs::remove_file(path.join("thesis.txt")).unwrap();
     fs::write(path.join("old.npy"), "").unwrap();
@@ -88,10 +89,10 @@ fn only_a_folder_of_columns_is_replaced() {
     assert_eq!(fs::read_dir(place.path()).unwrap().count(), 1, "the former folder is gone");
     let file = place.path().join("file.columns");
     fs::write(&file, "mine").unwrap();
-    assert_eq!(refused(&file, true), "it is not a folder of columns: name another one");
+    assert_eq!(refused(&file, true), "it exists and is not a folder of columns: name another folder");
     let link = place.path().join("link.columns");
     std::os::unix::fs::symlink(&path, &link).unwrap();
-    assert_eq!(refused(&link, true), "it is not a folder of columns: name another one");
+    assert_eq!(refused(&link, true), "it exists and is not a folder of columns: name another folder");
     let none = place.path().join("none/run.columns");
     assert!(refused(&none, true).ends_with("name a file in a folder that can be written"));
 }
@@ -109,7 +110,7 @@ fn what_a_killed_conversion_left_is_removed_and_nothing_else() {
     let refused = || {
         let error = ColumnFolder::create(&path, false).unwrap_err().to_string();
         assert!(
-            error.contains(".part exists, and no killed conversion has left it: move it away"),
+            error.contains(".part exists, but was not left by an interrupted conversion: move it away"),
             "{error}"
         );
     };

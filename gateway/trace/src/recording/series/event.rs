@@ -23,8 +23,8 @@ impl core::fmt::Display for RecordingEvent {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         let more = match self {
             Self::BrokeOff(_) => {
-                ": the run continues without it; the data recorded so far stays readable, and later data is only \
-                 counted"
+                ": the run continues without recording; the data recorded so far can be read, and later data \
+                 is only counted"
             }
             Self::Other(_) => "",
         };

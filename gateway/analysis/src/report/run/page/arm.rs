@@ -258,7 +258,7 @@ impl PageDraft<'_> {
         let figure = self
             .time_figure("active-cells", title, Axis::new("cells", ""))
             .draw_series("in the torque sum", SeriesShape::Steps, self.points(&motion.contributing))
-            .draw_series("in contact, by the central computation", SeriesShape::Steps, active)
+            .draw_series("in contact, according to the central computation", SeriesShape::Steps, active)
             .with_marks(self.marks());
         let mut section = Section::new("cells", "Active cells");
         section.text.extend(

@@ -62,8 +62,8 @@ impl PageDraft<'_> {
             [("due", &bus_figures.lines.due), ("in time", &bus_figures.lines.in_time)],
             [("late", &bus_figures.lines.late), ("missing", &bus_figures.lines.missing)],
         ];
-        let mut figures = vec![steps("replies", "due and in time, epoch by epoch", y.clone(), due)];
-        figures.extend((lost > 0).then(|| steps("late", "late and missing, when it became known", y, late)));
+        let mut figures = vec![steps("replies", "replies due and in time, per epoch", y.clone(), due)];
+        figures.extend((lost > 0).then(|| steps("late", "late and missing, when detected", y, late)));
         let slowest = self.time_figure(format!("slowest-{name}"), slowest, Axis::new("time", "ms"));
         let slowest = slowest.with_series([self.thinned_series("", &bus_figures.lines.slowest)]);
         figures.push(if lost > 0 { slowest } else { slowest.with_half_width() });
@@ -263,7 +263,7 @@ impl PageDraft<'_> {
             let uplink = bus_figures.table.uplink();
             row(format!("{name}: frames recorded"), bus_figures.frames, true);
             row(format!("{name}: frames that the recorder reported as lost"), bus_figures.dropped, true);
-            row(format!("{name}: packets that cells sent, by their own count"), uplink.sent, true);
+            row(format!("{name}: packets that cells sent, according to their counters"), uplink.sent, true);
             row(format!("{name}: packets that cells sent, but that were lost"), uplink.lost, true);
             row(format!("{name}: packets that cells sent, but that were refused"), uplink.rejected, false);
             row(format!("{name}: restarts of cells during the run"), u64::from(uplink.restarts), false);

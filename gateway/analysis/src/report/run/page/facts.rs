@@ -14,7 +14,8 @@ pub(super) fn capture_facts(run: &RunData, command: &str) -> Vec<(String, String
         let began = frames_only.began.map(format_utc).map(|began| ("first frame", began));
         let capture = ("capture", format!("{}, {}, {} bytes", run.name, frames_only.format, run.bytes));
         let skin = ("skin", frames_only.skin_file.clone());
-        let all = [Some(capture), Some(skin), began, Some(("command of the report", command.to_owned()))];
+        let all =
+            [Some(capture), Some(skin), began, Some(("command that made the report", command.to_owned()))];
         return all.into_iter().flatten().map(|(name, value)| (name.to_owned(), value)).collect();
     }
     let fact = |record: &str, key: &str| run.metadata_value(record, key).unwrap_or("unknown");
@@ -36,14 +37,14 @@ pub(super) fn capture_facts(run: &RunData, command: &str) -> Vec<(String, String
         facts.iter().map(|(key, value)| format!("{key} = {value}")).collect::<Vec<_>>().join("; ")
     });
     let facts = [
-        ("command of the run", Some(program("command_line").to_owned())),
+        ("command that started the run", Some(program("command_line").to_owned())),
         ("program", Some(format!("{}, revision {}", program("program"), program("git_revision")))),
         ("began", Some(began)),
         ("machine", Some(format!("{kernel}, {} processors", machine("processors")))),
         ("clock", Some(clock)),
         ("idle machine", idle),
         ("recording", Some(format!("{}, part {}, {} bytes", run.name, fact("part", "number"), run.bytes))),
-        ("command of the report", Some(command.to_owned())),
+        ("command that made the report", Some(command.to_owned())),
         ("configuration", configuration),
     ];
     facts.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?))).collect()
