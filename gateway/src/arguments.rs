@@ -16,8 +16,10 @@ use super::print::comma_separated;
 pub(crate) type OptionValue<T> = (&'static str, &'static str, T);
 
 /// Frame formats of a packet.
-pub(crate) const FORMATS: &[OptionValue<Format>] =
-    &[("fd", "One CAN FD frame", Format::Fd), ("classic", "Two to four classic frames", Format::Classic)];
+pub(crate) const FORMATS: &[OptionValue<Format>] = &[
+    ("fd", "Each packet is one CAN FD frame", Format::Fd),
+    ("classic", "Each packet is two to four classic frames", Format::Classic),
+];
 
 /// Creates a parser that accepts one of these words.
 pub(crate) fn one_of_values<T: Copy + Send + Sync + 'static>(
@@ -124,7 +126,7 @@ pub(crate) fn cells_per_process() -> Result<usize, Failure> {
 /// The option for the number of cells per process.
 #[derive(Args, Clone, Copy, Debug)]
 pub(crate) struct ProcessOptions {
-    /// Run up to N cells in one process
+    /// Run up to N cells in each process
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=254))]
     pub(crate) cells_per_process: u8,
 }
@@ -138,7 +140,7 @@ pub(crate) fn bus_names(skin: &Skin) -> impl Iterator<Item = &str> {
 pub(crate) fn find_bus(skin: &Skin, file: &str, name: &str) -> Result<usize, Failure> {
     skin.bus_index(name).ok_or_else(|| {
         let names = comma_separated(bus_names(skin));
-        Failure::usage_error(format!("bus {name} is not in {file}, which has {names}"))
+        Failure::usage_error(format!("the skin file {file} has no bus {name}; its buses are {names}"))
     })
 }
 
@@ -163,7 +165,9 @@ pub(crate) fn find_cell(skin: &Skin, name: &CellName, option: &str) -> Result<us
         cells => {
             let choices = cells.iter().map(|(_, cell)| skin.full_cell_name(cell.bus, cell.node));
             let choices = comma_separated(choices.map(|name| name.to_string()));
-            Err(Failure::usage_error(format!("{option} {node} is on several buses: choose one of {choices}")))
+            Err(Failure::usage_error(format!(
+                "{option} {node}: several buses have a cell with this node id; choose one of {choices}"
+            )))
         }
     }
 }

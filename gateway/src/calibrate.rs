@@ -38,7 +38,7 @@ use super::output::{OverwriteOption, check_distinct_files, print_beside_files, p
 use super::print::{count_with_noun, to_pretty_json};
 use super::robot_file::{SkinRobot, urdf_path};
 
-/// Find the poses of cells from their accelerometers
+/// Estimate the poses of cells from their accelerometers while the robot moves
 ///
 /// Moves the robot through poses and swings within its limits and records the cells' accelerations. Estimates for each
 /// cell the joint that moves it, its position and orientation, and the bias and gain of its sensor, each with its
@@ -51,18 +51,19 @@ use super::robot_file::{SkinRobot, urdf_path};
   skinbus calibrate skin.toml --recording run.mcap --page found.html
   skinbus calibrate skin.toml --dry-run > motion.json")]
 pub(crate) struct CalibrateCommand {
-    /// Skin file with robot, buses and cells; the poses of the cells may be wrong
+    /// The skin file (TOML); the positions and normals of its cells may be wrong
     skin: PathBuf,
-    /// Write a copy of the skin file with the poses found
+    /// Write a copy of the skin file with the estimated poses of the cells
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Use a recording or candump log instead of a run; name all parts of a split recording
+    /// Use this recording or candump log instead of moving the robot; for a split recording, give the option for each
+    /// part
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["record", "no_spawn", "dry_run"])]
     recording: Vec<PathBuf>,
-    /// Save the recording of the run in this file
+    /// Record the calibration run in this file
     #[arg(long, value_name = "FILE.mcap")]
     record: Option<PathBuf>,
-    /// Write the result as an HTML page with a 3D view, with a line from each old position to the new one
+    /// Write the result as an HTML page with a 3D view: a line joins the old and the new position of each cell
     #[arg(long, value_name = "FILE.html")]
     page: Option<PathBuf>,
     /// Start pose of the robot: a position in rad or m for each joint, separated by spaces. Default: the middle of the
@@ -75,25 +76,25 @@ pub(crate) struct CalibrateCommand {
     /// Maximum duration of the motion
     #[arg(long, value_name = "TIME", default_value = "150s", value_parser = parse_duration)]
     duration: f64,
-    /// Distance between wired cells in mm; it improves the positions found
+    /// Distance in mm between cells that a wire connects; knowing it makes the estimated positions more accurate
     #[arg(long, value_name = "MM")]
     spacing: Option<f64>,
-    /// Also estimate a zero offset for each joint
+    /// Also estimate the zero offset of each joint's encoder
     #[arg(long)]
     zero_offsets: bool,
     /// Data sheet of the accelerometers as TOML, with the keys of a scenario's [sensors.acceleration]. Default: a
     /// BMA250
     #[arg(long, value_name = "FILE")]
     data_sheet: Option<PathBuf>,
-    /// Print the motion as JSON and move nothing
+    /// Print the planned motion as JSON, and do not move the robot
     #[arg(long)]
     dry_run: bool,
-    /// Start no cells; use the real or simulated cells that are already on the buses
+    /// Do not start cells: use the real or simulated cells that are already on the buses
     #[arg(long)]
     no_spawn: bool,
     #[command(flatten)]
     kinds: BusKinds,
-    /// Show no progress
+    /// Do not show progress
     #[arg(long, short)]
     quiet: bool,
     /// Print one JSON object instead of text
@@ -143,7 +144,7 @@ impl CalibrateCommand {
         match calibration.summary.troubled {
             0 => Ok(()),
             troubled => Err(Failure::run_error(format!(
-                "{}: {} of {} are unreliable: the lines above state why",
+                "{}: {} of {} are unreliable; see the reasons above",
                 skin.name,
                 troubled,
                 count_with_noun(skin.cells.len(), "cell")
@@ -155,7 +156,7 @@ impl CalibrateCommand {
         let mut bounds =
             PlanBounds { within: self.within, length_s: self.duration, ..PlanBounds::from_skin(skin) };
         if !(0.05..=6.3).contains(&self.within) {
-            return Err(Failure::usage_error(format!("--within {}: use 0.05 to 6.3", self.within)));
+            return Err(Failure::usage_error(format!("--within {}: use 0.05 to 6.3 rad or m", self.within)));
         }
         if let Some(start) = &self.start {
             let number = |word: &str| {
@@ -212,7 +213,7 @@ impl CalibrateCommand {
             run::run(&options, Vec::new()).map_err(|error| Failure::with_code(error.exit_code(), error))?;
         let mut complaints = summary.end_messages(self.quiet);
         if summary.outcome != Outcome::Done {
-            let last = complaints.pop().unwrap_or_else(|| "the run did not finish".to_owned());
+            let last = complaints.pop().unwrap_or_else(|| "the run ended too early".to_owned());
             return Err(Failure::run_error(last));
         }
         complaints.iter().for_each(|line| print_note(format_args!("skinbus: {line}")));
@@ -333,8 +334,8 @@ fn report_text(skin: &Skin, calibration: &Calibration) -> String {
         (summary.position_mm, summary.orientation_deg, summary.noise_mg)
     {
         lines.push(format!(
-            "pose uncertainty {mm:.2} mm and {degrees:.2} degrees (median of the 95 % limits); readings \
-             scatter by {mg:.1} mg"
+            "pose uncertainty {mm:.2} mm and {degrees:.2} degrees (median of the 95 % limits); standard \
+             deviation of the readings: {mg:.1} mg"
         ));
     }
     lines.push(summary.joints.to_string());

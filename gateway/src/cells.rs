@@ -22,7 +22,7 @@ const DEFAULT_LISTEN_S: f64 = 1.0;
 /// Interval between updates of the list.
 const UPDATE_INTERVAL: Duration = Duration::from_millis(500);
 
-/// List the cells on a bus with their reports
+/// List the cells on a bus with their states and counters
 ///
 /// Queries all cells for their counters and their position in the network, and listens for one second. `-` marks values
 /// that a cell has not reported. Empty columns are omitted, and so are the counters on narrow terminals. Ports show the
@@ -34,9 +34,9 @@ const UPDATE_INTERVAL: Duration = Duration::from_millis(500);
   skinbus cells can0 --skin skin.toml --watch
   skinbus cells vcan0 --json | jq '.cells[] | select(.configured | not) | .node'")]
 pub(crate) struct CellsCommand {
-    /// The bus
+    /// Name of the bus, such as can0
     bus: String,
-    /// Compare with this skin: show which cells have its configuration, and which are missing
+    /// Skin file to compare with: show which cells have its configuration, and which are missing
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
     /// Update the list until Ctrl-C
@@ -45,7 +45,7 @@ pub(crate) struct CellsCommand {
     /// Print one JSON object; with --watch, one per line
     #[arg(long, short)]
     json: bool,
-    /// Time for which to listen [default: 1s; no limit with --watch]
+    /// List the cells that send within this time [default: 1s; with --watch, no limit]
     #[arg(long, value_name = "TIME", value_parser = parse_duration, allow_negative_numbers = true)]
     duration: Option<f64>,
     #[command(flatten)]
@@ -103,7 +103,7 @@ impl CellsCommand {
             let (name, seconds) = (&self.bus, watch.elapsed().as_secs_f64());
             let others = match watch.non_packet_count() {
                 0 => String::new(),
-                others => format!(" ({others} frames are not from cells; `skinbus dump` shows them)"),
+                others => format!(" ({others} other frames were received; `skinbus dump` shows them)"),
             };
             return Err(Failure::run_error(format!(
                 "no cell sent anything on {name} for {seconds:.1} s{others}: start the cells, or switch them on"

@@ -23,20 +23,20 @@ use self::skin::ListedCells;
   skinbus check scenario.toml --skin skin.toml --json | jq '.events[] | select(.what == \"touch\")'
   skinbus check skin.toml --cell vcan0:12")]
 pub(crate) struct CheckCommand {
-    /// Skins and scenarios; - for standard input
+    /// Skin and scenario files (TOML); - for standard input
     #[arg(value_name = "FILE", required = true)]
     files: Vec<PathBuf>,
-    /// The skin of the scenarios [default: the skin among the files]
+    /// Skin file that the scenarios refer to [default: the skin among the files]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
     /// Also list the cells of skins, one per line: position in the frame of the joint, neighbours, and configuration
     /// hash
     #[arg(long)]
     list: bool,
-    /// List only this cell
+    /// Show only this cell of the skin
     #[arg(long, value_name = "[BUS:]NODE", conflicts_with = "list")]
     cell: Option<CellName>,
-    /// Print one JSON object per file, with the names of the files' keys
+    /// Print one JSON object per file; its keys are those of the TOML files
     #[arg(long, short)]
     json: bool,
 }
@@ -90,7 +90,7 @@ impl CheckCommand {
 fn ambiguous_skin_failure(file: &Path, found: &str) -> Failure {
     let file = file.display();
     Failure::usage_error(format!(
-        "{file} is a scenario, and {found} among the files: name its skin with --skin"
+        "{file} is a scenario, but {found} among the files: name the skin of the scenario with --skin"
     ))
 }
 

@@ -20,7 +20,7 @@ use super::output::{OverwriteOption, check_distinct_files, print_beside_files};
 use super::print::{abbreviate_names, comma_separated};
 use super::{input, output};
 
-/// Write a skin's description into its cells, and read it back
+/// Write the parameters in a skin file into its cells, and read them back
 ///
 /// Finds each cell by its serial number, writes the robot's table, the pose, gains and thresholds into its flash, reads
 /// everything back and compares. A cell applies its new parameters all at once, so the command may be interrupted at
@@ -34,25 +34,25 @@ use super::{input, output};
   skinbus commission skin.toml --verify --json | jq '.buses[0].failed'
   skinbus commission skin.toml --node-ids as-wired.toml && skinbus run as-wired.toml --no-spawn")]
 pub(crate) struct CommissionCommand {
-    /// The skin
+    /// Skin file (TOML) that describes the robot, buses and cells
     skin: PathBuf,
-    /// Commission only this bus of the skin
+    /// Commission the cells of this bus only
     #[arg(long, value_name = "NAME")]
     bus: Option<String>,
     #[command(flatten)]
     kinds: BusKinds,
-    /// Write nothing: list the cells found and those that would be written
+    /// Write nothing to the cells: only list those found, and those that would be written
     #[arg(long)]
     dry_run: bool,
-    /// Also read back and compare cells that already have the right hash
+    /// Also read back and compare the parameters of cells whose configuration hash is already right
     #[arg(long)]
     verify: bool,
-    /// Write a copy of the skin with the node ids that the cells have on their buses
+    /// Write a copy of the skin file with the node ids that the cells actually use
     #[arg(long, value_name = "FILE")]
     node_ids: Option<PathBuf>,
     #[command(flatten)]
     overwrite: OverwriteOption,
-    /// Show no progress, only the table at the end
+    /// Show only the table at the end, without progress
     #[arg(long, short)]
     quiet: bool,
     /// Print one JSON object instead of the table

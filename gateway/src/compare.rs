@@ -55,23 +55,23 @@ Keys of --json:
   first              the first difference: what, how, bus, cell, joint, epoch, number, time_s,
                      words, values, unit, steps, inputs, unknown_inputs, occurrence")]
 pub(crate) struct CompareCommand {
-    /// An MCAP recording or a candump log; - for standard input. For a split recording name the first part; the other
-    /// parts beside it are read too
+    /// MCAP recording or candump log; - for standard input. For a split recording, name the first part: the other parts
+    /// are found beside it
     #[arg(value_name = "A")]
     a: PathBuf,
-    /// The other recording or log
+    /// The MCAP recording or candump log to compare A with
     #[arg(value_name = "B")]
     b: PathBuf,
-    /// The skin [default: the skin in a recording]
+    /// Skin file of both [default: the skin in a recording]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// Accept differences of up to this many steps: for torque words 1/4096 Nm each, for sums 1/256 Nm each
+    /// Accept torques that differ by up to this many steps; a step is 1/4096 Nm, for sums 1/256 Nm
     #[arg(long, value_name = "STEPS", default_value_t = 0)]
     tolerance: u16,
-    /// Accept differences between joint words of up to this many steps of 1/16384 quarter turn or m
+    /// Accept joint positions that differ by up to this many steps; a step is 1/16384 of a quarter turn or of a metre
     #[arg(long, value_name = "STEPS", default_value_t = 0)]
     joints_tolerance: u16,
-    /// Accept up to this many replies and joints messages that only one run has
+    /// Accept up to this many replies and joints messages that one of the two runs lacks
     #[arg(long, value_name = "N", default_value_t = 0)]
     allow_missing: u64,
     /// Print one JSON object instead of the table
@@ -167,7 +167,7 @@ impl CompareCommand {
         check_distinct_files([("--junit", self.junit.as_deref())], read)?;
         if [&self.a, &self.b].iter().all(|file| is_standard_input(file)) {
             return Err(Failure::usage_error(
-                "- and -: standard input can be read only once: name a file instead of one -",
+                "both inputs are - (standard input), which can be read only once: name a file for one of them",
             ));
         }
         let files = PerCapture { a: recording_parts(&self.a)?, b: recording_parts(&self.b)? };
@@ -259,7 +259,9 @@ impl CompareCommand {
             }
         }
         let (a, b) = (self.a.display(), self.b.display());
-        Err(Failure::usage_error(format!("neither {a} nor {b} contains a skin: name one with --skin")))
+        Err(Failure::usage_error(format!(
+            "neither {a} nor {b} contains a skin: name the skin file with --skin"
+        )))
     }
 
     /// Refuses a capture without frames or joints, or of another skin.
@@ -288,8 +290,8 @@ impl CompareCommand {
         }
         comparison.reported_and_matching_cells(which).map_or(Ok(()), |(all, same)| {
             Err(Failure::usage_error(format!(
-                "{name} does not match the skin {}: of {}, only {same} have the parameters of this skin; name the \
-                 right skin with --skin",
+                "{name} was recorded with another skin than {}: of {}, only {same} have the parameters of \
+                 this skin; name the right skin with --skin",
                 skin.name,
                 count_with_noun(all, "cell")
             )))
@@ -305,7 +307,8 @@ fn check_same_skin(
     let Some((what, is, was)) = first_skin_difference(skin, own) else { return Ok(()) };
     let (one, other) = (one.as_ref().display(), other.as_ref().display());
     Err(Failure::usage_error(format!(
-        "{one} and {other} have different skins ({what}: {is}, in the other: {was}): compare captures of one skin"
+        "{one} and {other} were recorded with different skins ({what}: {is}, in the other: {was}); only runs \
+         with the same skin can be compared"
     )))
 }
 

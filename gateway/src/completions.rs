@@ -16,7 +16,7 @@ use super::output::{OverwriteOption, is_standard_output, print_note};
   skinbus completions zsh > ~/.zfunc/_skinbus
   skinbus completions fish > ~/.config/fish/completions/skinbus.fish")]
 pub(crate) struct CompletionsCommand {
-    /// The shell
+    /// Shell that will use the completions
     shell: Shell,
 }
 
@@ -34,7 +34,7 @@ impl CompletionsCommand {
   skinbus man ~/.local/share/man/man1
   skinbus man - | man -l -")]
 pub(crate) struct ManCommand {
-    /// Existing directory for the pages; - writes skinbus.1 to standard output
+    /// Existing directory for the man pages; - prints only skinbus.1
     #[arg(value_name = "DIR")]
     folder: PathBuf,
     #[command(flatten)]

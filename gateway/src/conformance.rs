@@ -25,7 +25,7 @@ use super::{input, output};
 /// Maximum duration of a test, without the time to listen at the start and to restore the cell at the end.
 const MAX_TEST_DURATION: Span = Span::from_millis(80_000);
 
-/// Test one cell of any make against the documented requirements
+/// Test a cell from any manufacturer against the documented requirements
 ///
 /// Checks all numbered requirements of cell.md and sensing.md in at most 90 s and prints a verdict on each, with the
 /// frames that show a failure. The test commits configurations of its own: it first saves the cell's configuration to a
@@ -38,10 +38,10 @@ const MAX_TEST_DURATION: Span = Span::from_millis(80_000);
   skinbus conformance --bus can0 --cell 12 --requirement CONF,COUNT-1
   skinbus conformance --bus can0 --cell 12 --restore conformance-can0-12.json")]
 pub(crate) struct ConformanceCommand {
-    /// Bus of the cell, if --cell does not name it
+    /// Name of the cell's bus, unless --cell names it
     #[arg(long, value_name = "NAME")]
     bus: Option<String>,
-    /// Cell to test
+    /// Cell to test, by node id
     #[arg(long, value_name = "[BUS:]NODE")]
     cell: CellName,
     #[command(flatten)]
@@ -49,17 +49,17 @@ pub(crate) struct ConformanceCommand {
     /// Frame format of the bus [default: the format of the cell's heartbeats]
     #[arg(long, value_parser = one_of_values(FORMATS))]
     format: Option<Format>,
-    /// Test only these requirements: CONF-7, or CONF for all whose ids begin with CONF
+    /// Test only these requirements, such as CONF-7, or CONF for all whose ids begin with CONF
     #[arg(long, value_name = "ID", value_delimiter = ',')]
     requirement: Vec<String>,
-    /// Shell command that switches the cell off and on; needed for the requirements on the start of a cell
+    /// Shell command that switches the cell's power off and on; requirements on the start of a cell are tested only
+    /// with it
     #[arg(long, value_name = "COMMAND")]
     restart: Option<String>,
-    /// Test even if other cells are on the bus; they also receive the joints and halt messages that
-    /// the test sends
+    /// Test even if other cells are on the bus; the joints and halt messages of the test reach and stop them too
     #[arg(long)]
     others_will_stop: bool,
-    /// Save the cell's configuration to this file [default: conformance-BUS-NODE.json]
+    /// Save the cell's configuration to this file before the test changes it [default: conformance-BUS-NODE.json]
     #[arg(long, value_name = "FILE")]
     save: Option<PathBuf>,
     /// Restore the configuration that an earlier test saved in this file, delete the file, and test nothing

@@ -58,35 +58,37 @@ const WRITE_BYTES: usize = 1 << 18;
   skinbus convert run.mcap run-*.mcap run.columns
   candump -L can0 | skinbus convert - can0.mcap")]
 pub(crate) struct ConvertCommand {
-    /// A candump log or an MCAP recording; - for standard input. Several are read as one: the parts of a split
-    /// recording in any order, other captures in the order of their first frames
+    /// Candump logs or MCAP recordings; - for standard input. Several files are joined: parts of a split recording in
+    /// the order of their numbers, other files in the order of their first frames
     #[arg(value_name = "IN", required = true)]
     from: Vec<PathBuf>,
-    /// The new capture, CSV file or folder of columns; - for candump text on standard output
+    /// File to write, by its extension: .mcap, .log or .txt (candump log), .csv (torques), .columns (folder of NumPy
+    /// files); - for candump text on standard output
     #[arg(value_name = "OUT")]
     to: PathBuf,
     #[command(flatten)]
     overwrite: OverwriteOption,
-    /// Fail at the first malformed frame line, or if IN is truncated; then write nothing
+    /// Fail, and write nothing, at the first line that is not a valid frame, or if IN is truncated
     #[arg(long)]
     strict: bool,
-    /// Number of decimals of a second in a log [default: as many as IN has]
+    /// Number of decimals of the time stamps in a candump log [default: as many as IN has]
     #[arg(long, value_parser = one_of_values(DIGITS), value_name = "N")]
     digits: Option<TimeDigits>,
-    /// Append the direction, T or R, to each frame of a log; Wireshark cannot read such logs. Without this option,
-    /// directions are written only if IN is a log that has them
+    /// Append the direction of each frame, T (sent) or R (received), in a candump log, which Wireshark then cannot
+    /// read. By default, directions are written only if IN is a log that has them
     #[arg(long, conflicts_with = "plain")]
     direction: bool,
-    /// Write only what every tool can read: time stamps with 6 decimals, and no directions, raw DLCs or comments
+    /// Write a candump log that every tool can read: time stamps with 6 decimals, without directions, raw DLCs and
+    /// comments
     #[arg(long)]
     plain: bool,
-    /// For a CSV file or columns: the skin [default: the skin in the recording]
+    /// Skin file for a CSV file or columns [default: the skin in the recording]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
 }
 
 /// Hint in the error for a capture that is truncated and was refused because of `--strict`.
-const WITHOUT_STRICT_HINT: &str = "without --strict the intact part would be written";
+const WITHOUT_STRICT_HINT: &str = "leave out --strict to write the intact part";
 
 const DIGITS: &[OptionValue<TimeDigits>] = &[("6", "", TimeDigits::Six), ("9", "", TimeDigits::Nine)];
 
@@ -108,7 +110,7 @@ impl ConvertCommand {
         let text = format == CaptureFormat::Candump;
         if let Some(option) = self.text_option().filter(|_| !text) {
             return Err(Failure::usage_error(format!(
-                "{option} is only for a candump log: leave it out, because a recording keeps everything"
+                "{option} is only for a candump log: leave it out, because an MCAP recording keeps everything"
             )));
         }
         let to = self.to.display();
@@ -157,13 +159,18 @@ impl ConvertCommand {
             named += 1;
             let place = location(&name, line.line);
             if self.strict {
-                return Err(format!("{place}: {why}; without --strict, the line would be kept as it is"));
+                return Err(format!("{place}: {why}; leave out --strict to keep such lines unchanged"));
             }
             if named <= MAX_REPORTED_LINES {
                 bar.suspend(|| print_note(format_args!("{place}: {why}")));
             }
             if named == MAX_REPORTED_LINES {
-                bar.suspend(|| print_note(format_args!("{name}: further unreadable lines are only counted")));
+                bar.suspend(|| {
+                    print_note(format_args!(
+                        "{name}: further lines that cannot be read are \
+                                                        counted, but not shown"
+                    ))
+                });
             }
             Ok(())
         });
@@ -289,7 +296,7 @@ impl ConvertCommand {
         missing.print_counts(&reader, "left out");
         if let Some(buses) = torques::buses_with_sums(&skin) {
             print_note(format_args!(
-                "{name}: the cells on {buses} answer with sums: distributed torques and errors are empty"
+                "{name}: the cells on {buses} answer with sums, so distributed torques and errors are empty"
             ));
         }
         print_note(format_args!("{name} -> {to}: {epochs} epochs"));
@@ -323,7 +330,7 @@ impl ConvertCommand {
     /// Returns the format of OUT, according to its name.
     fn format(&self) -> Result<CaptureFormat, Failure> {
         if is_standard_output(&self.to) && io::stdout().is_terminal() {
-            let why = "standard output is a terminal, and a log may contain control characters";
+            let why = "standard output is a terminal, which control characters in a log could disturb";
             return Err(Failure::usage_error(format!(
                 "-: {why}: pipe it to a program, name a file, or view it with `skinbus dump`"
             )));
@@ -432,31 +439,31 @@ fn progress_bar(size: Option<u64>) -> ProgressBar {
 /// Returns the notes on a conversion, one per line.
 fn remarks(reader: &Reader, done: &ConversionCounts, style: &LogStyle, text: bool) -> Vec<String> {
     let mut lines = reader.remarks();
-    let how = if style.plain { "" } else { ", which not every tool reads; --direction writes it" };
+    let how = if style.plain { "" } else { ": some tools cannot read it; add --direction to write it" };
     let LossCounts { digits, direction, raw_dlc, name } = done.shortened;
-    let written = ["frame is written", "frames are written"];
+    let written = ["frame was written", "frames were written"];
     for (count, [one, more], what) in [
         (
             done.unreadable,
-            ["line begins like a frame but is not one", "lines begin like frames but are not"],
+            ["line looks like a frame but is malformed", "lines look like frames but are malformed"],
             ": not read",
         ),
         (
             done.unreadable_messages,
-            ["message does not match its type", "messages do not match their types"],
+            ["MCAP message does not match its type", "MCAP messages do not match their types"],
             ": not read",
         ),
         (done.can_xl, ["is a CAN XL frame", "are CAN XL frames"], ": not read"),
         (done.dropped, ["frame is missing", "frames are missing"], ": lost by the recorder"),
-        (digits, written, " without digits of time below 1 us"),
-        (direction, written, &format!(" without direction{how}")),
-        (raw_dlc, written, " without raw DLC"),
+        (digits, written, " without the digits of the time below 1 us"),
+        (direction, written, &format!(" without their direction{how}")),
+        (raw_dlc, written, " without their raw DLC"),
         (
             name,
-            ["frame has a bus", "frames have a bus"],
-            " whose name was changed: blanks and control characters are _ in a log",
+            ["frame is from a bus", "frames are from a bus"],
+            " whose name was changed, because a log cannot hold blanks and control characters: they became _",
         ),
-        (done.omitted, ["note is left out", "notes are left out"], ""),
+        (done.omitted, ["note was left out", "notes were left out"], ""),
     ] {
         if count > 0 {
             lines.push(format!("{count} {}{what}", if count == 1 { one } else { more }));
@@ -465,7 +472,7 @@ fn remarks(reader: &Reader, done: &ConversionCounts, style: &LogStyle, text: boo
     match describe_other_contents(reader) {
         others if others.is_empty() => {}
         others if text => lines.push(format!("a candump log cannot hold {others}")),
-        others => lines.push(format!("only frames are written, without {others}")),
+        others => lines.push(format!("only CAN frames were written, not {others}")),
     }
     lines
 }

@@ -49,15 +49,15 @@ use super::print::{comma_separated, to_pretty_json};
   skinbus dump can0 --stats --to 10
   candump -L can0 | skinbus dump - -n 100")]
 pub(crate) struct DumpCommand {
-    /// Buses; or a candump log or MCAP recording, if a file has this name; - for standard input. The parts of a split
-    /// recording are read as one, in any order
+    /// Names of buses to listen to; or candump logs or MCAP recordings; - for standard input. A name is a file if that
+    /// file exists. The parts of a split recording are read as one, in any order
     #[arg(required = true, value_name = "BUS|FILE")]
     sources: Vec<PathBuf>,
     /// Show only frames of these kinds: command, sum, torque, sensors, network, configure, configured, stimulus, wire,
     /// foreign, damaged; or a single command: halt, joints, sync, resume, report. Kind foreign includes damaged
     #[arg(long, value_name = "KIND", value_delimiter = ',')]
     kind: Vec<FrameSelector>,
-    /// Show only packets from or to these nodes: cells, gateway or everyone
+    /// Show only packets from or to these nodes: a node id, gateway or everyone
     #[arg(long, value_name = "[BUS:]NODE", value_delimiter = ',')]
     cell: Vec<NodeSelector>,
     /// Show only frames of these buses
@@ -67,20 +67,21 @@ pub(crate) struct DumpCommand {
     /// is the mask of the bits to compare
     #[arg(long, value_name = "ID[:MASK]", value_delimiter = ',')]
     id: Vec<IdMask>,
-    /// Show only traffic of touches: torques and sums other than zero, stimuli and sensors with a contact force or a
+    /// Show only frames that belong to touches: nonzero torques and sums, stimuli and sensor pages with a force or a
     /// proximity, heartbeats of active cells
     #[arg(long)]
     contact: bool,
-    /// Show frames from this time on: seconds since the start of the run, or of a log since its first frame
+    /// Show frames from this time on: seconds since the start of the run, or since the first frame of a log
     #[arg(long, value_name = "S", value_parser = parse_time_ns, allow_negative_numbers = true)]
     from: Option<u64>,
-    /// Show frames before this second, counted like --from; ends a live dump
+    /// Show frames before this time, in seconds as for --from; a live dump ends there
     #[arg(long, value_name = "S", value_parser = parse_time_ns, allow_negative_numbers = true)]
     to: Option<u64>,
     /// End after showing or counting this many frames
     #[arg(long, short = 'n', value_name = "COUNT")]
     count: Option<u64>,
-    /// Print the bus and the time since the start of the run (of a log: since its first frame) instead of the raw frame
+    /// Print the bus and the time, in seconds since the start of the run or since the first frame of a log, instead of
+    /// the raw frame
     #[arg(long, conflicts_with_all = ["json", "stats"])]
     brief: bool,
     /// Print one JSON object per line; with --stats, one in total
@@ -93,15 +94,15 @@ pub(crate) struct DumpCommand {
     /// and unanswered joints; so of the filters only --bus, --from, --to and --count are allowed.
     #[arg(long, conflicts_with_all = ["kind", "cell", "id", "contact"])]
     stats: bool,
-    /// Frame format of packets; auto accepts both
+    /// Frame format of the packets: FD, classic, or auto for both
     #[arg(long, value_parser = one_of_values(ANY_FORMAT), default_value = "auto")]
     format: PacketFormat,
-    /// The skin, which gives torques and positions their units [default: the skin in the recording]
+    /// Skin file, from which the units of torques and positions are known [default: the skin in the recording]
     ///
-    /// Without a skin, torques are read as Q3.12, and joints as revolute.
+    /// Without a skin, torques are decoded as Q3.12, and joints as revolute.
     #[arg(long, value_name = "SKIN", conflicts_with = "stats")]
     skin: Option<PathBuf>,
-    /// Wait for buses that do not exist yet
+    /// If a bus does not exist yet, wait for it instead of failing
     #[arg(long)]
     wait: bool,
     #[command(flatten)]
@@ -112,9 +113,9 @@ pub(crate) struct DumpCommand {
 type PacketFormat = Option<Format>;
 
 const ANY_FORMAT: &[OptionValue<PacketFormat>] = &[
-    ("auto", "Accept both formats", None),
-    ("fd", "One CAN FD frame", Some(Format::Fd)),
-    ("classic", "Two to four classic frames", Some(Format::Classic)),
+    ("auto", "Accept packets in both formats", None),
+    ("fd", "Each packet is one CAN FD frame", Some(Format::Fd)),
+    ("classic", "Each packet is two to four classic frames", Some(Format::Classic)),
 ];
 
 impl DumpCommand {
@@ -143,7 +144,7 @@ impl DumpCommand {
             if let Some(other) = pick.bus_names().find(|bus| !names.iter().any(|name| name == bus)) {
                 let names = comma_separated(&names);
                 return Err(Failure::usage_error(format!(
-                    "bus {other} is not among the dumped buses: name it in addition to {names}"
+                    "bus {other} is not one of the buses to dump ({names}): name it too"
                 )));
             }
             if let Some(file) = self.sources.iter().find(|source| self.wait && is_path(source)) {
@@ -169,7 +170,8 @@ impl DumpCommand {
             let mut reader = open_capture(&self.sources, |file| Box::new(file))?;
             reader.name().clone_into(&mut title);
             if self.skin.is_none() && !self.stats {
-                let instead = "torques are read as Q3.12 and joints as revolute: name the skin with --skin";
+                let instead = "torques are decoded as Q3.12 and joints as revolute, because the skin is \
+                               unknown: name it with --skin";
                 if let Some(skin) = skin_found_so_far(&reader, instead) {
                     show.set_units(&skin);
                 }
@@ -209,7 +211,7 @@ impl DumpCommand {
         if let (Some(bus), Some(file)) = (other, sources.iter().find(|source| is_file(source))) {
             let (bus, file) = (bus.display(), file.display());
             return Err(Failure::usage_error(format!(
-                "{file} is a file, but there is no file {bus}: name only the parts of one recording, or only buses"
+                "{file} is a file, but {bus} is not: name only the parts of one recording, or only buses"
             )));
         }
         if let Some(folder) = sources.iter().find(|source| source.is_dir()) {
@@ -272,7 +274,7 @@ fn show_capture(reader: &mut Reader, show: &mut FrameOutput<impl Write>) -> Resu
                     NoteKind::Dropped(lost) => {
                         show.count_dropped(note.interface, lost);
                         output::print_note(format_args!(
-                            "{place}: {lost} frames are missing here: the recorder lost them"
+                            "{place}: {lost} frames are missing here, because the recorder lost them"
                         ));
                     }
                     NoteKind::Unreadable(why) => output::print_note(format_args!("{place}: {why}")),

@@ -48,15 +48,15 @@ pub(crate) struct ExperimentCommand {
     /// Names of experiments; all runs every experiment, and list describes them
     #[arg(value_name = "NAME", required = true)]
     names: Vec<ExperimentArgument>,
-    /// Directory for the results; created if it does not exist
+    /// Directory for the results, which is created if necessary
     #[arg(long, short, value_name = "DIR")]
     output: Option<PathBuf>,
     #[command(flatten)]
     overwrite: OverwriteOption,
-    /// Measure with few cells for a few seconds, to check that everything works
+    /// Try out the experiments with few cells for a few seconds; the results are not valid
     #[arg(long)]
     quick: bool,
-    /// Show no progress and no findings
+    /// Show neither progress nor findings
     #[arg(long, short)]
     quiet: bool,
 }
@@ -151,7 +151,7 @@ impl ExperimentCommand {
             ("command", Some(command)),
             ("program", Some(format!("{}, revision {}", fact("program"), fact("git_revision")))),
             ("machine", Some(machine())),
-            ("idle lateness", idle),
+            ("late wake-ups, idle", idle),
             ("effort", self.quick.then(|| quick.to_owned())),
         ];
         let facts = facts.into_iter().filter_map(|(name, fact)| Some((name.to_owned(), fact?))).collect();
@@ -268,7 +268,7 @@ fn print_findings(page: &Page, report: &Path) -> Result<(), Failure> {
     let worse = if worse == 0 {
         String::new()
     } else {
-        format!("results worse than in the paper or than required: {worse}\n")
+        format!("results that are worse than the paper's, or than required: {worse}\n")
     };
     print_text(&format!("{}{worse}{}\n", rows.to_text(), report.display()))
 }

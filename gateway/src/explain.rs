@@ -19,7 +19,7 @@ use super::input::{is_file, is_path, no_frame_failure, note_skin_difference, ski
 use super::output;
 use super::print::to_pretty_json;
 
-/// Explain the torque of one epoch, or compute that of a force on a cell
+/// Explain how the torques of one epoch came about, or compute those of a given force
 ///
 /// Reads a capture up to the joints of that epoch. Shows each cell's contact state, the force that it computes, the
 /// Jacobian, their product in double precision, the nearest step of 2^-12 Nm, and the word that the cell sent; then the
@@ -42,28 +42,29 @@ Examples:
   skinbus explain skin.toml --cell 12 --force 2.5 --joints \"0 -1.2 1.0 -1.4 -1.57 0\"
   skinbus explain skin.toml --batch rows.csv --json > torques.jsonl")]
 pub(crate) struct ExplainCommand {
-    /// A candump log or an MCAP recording, or all parts of a split one in any order; - for standard input. With --force
-    /// or --batch: a skin or a recording
+    /// A candump log or an MCAP recording (all parts of a split one, in any order); - for standard input. With --force
+    /// or --batch: a skin file or a recording
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
-    /// Epoch of the joint broadcast: its number modulo 256
+    /// Explain the torques for the joint broadcast with this epoch, which is its number modulo 256
     #[arg(long, value_name = "E", required_unless_present_any = ["force", "batch"])]
     epoch: Option<u8>,
-    /// Explain a joint broadcast from this time on: seconds since the start of the run, or of a log since its first frame
+    /// Take the first joint broadcast of the epoch at or after this time: seconds since the start of the run, or since
+    /// the first frame of a log
     #[arg(long, value_name = "S", value_parser = parse_time_ns, default_value = "0", conflicts_with_all = ["force", "batch"])]
     at: u64,
-    /// Explain the Kth joint broadcast of this epoch, if there are several
+    /// Take the Kth joint broadcast of the epoch, because epochs repeat after 256 broadcasts
     #[arg(long, value_name = "K", default_value_t = 1, conflicts_with_all = ["force", "batch"], value_parser = clap::value_parser!(u32).range(1..))]
     occurrence: u32,
-    /// Show all steps of one cell
+    /// Show every step of the computation of one cell
     #[arg(long, value_name = "[BUS:]NODE")]
     cell: Option<CellName>,
-    /// Show one joint, cell by cell
+    /// Show the torques of all cells on this joint
     #[arg(long, value_name = "J", conflicts_with_all = ["force", "batch"], value_parser = clap::value_parser!(u8).range(1..=32))]
     joint: Option<u8>,
     #[command(flatten)]
     given: torque::TorqueOptions,
-    /// The skin [default: the skin in the recording]
+    /// Skin file [default: the skin in the recording]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
     /// Print one JSON object; with --batch, one per row
@@ -102,8 +103,8 @@ impl ExplainCommand {
             RequestedJoints { epoch: Epoch(epoch), from_ns: self.at, occurrence: self.occurrence };
         let found = read_to_joints(&mut reader, &skin, requested).map_err(Failure::run_error)?;
         for (count, what) in [
-            (found.dropped, "frames are missing before this point; contact states may be out of date"),
-            (found.unreadable, "lines before this point could not be read"),
+            (found.dropped, "frames are missing before this broadcast, so contact states may be outdated"),
+            (found.unreadable, "lines before this broadcast could not be read"),
         ] {
             if count > 0 {
                 output::print_note(format_args!("{name}: {count} {what}"));

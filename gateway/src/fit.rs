@@ -38,42 +38,44 @@ use super::print::comma_separated;
   skinbus fit run.log --skin skin.toml --json | jq -c 'select(.end_s and .end_s - .time > 0.016)'
   skinbus fit vcan0 vcan1 --duration 10")]
 pub(crate) struct FitCommand {
-    /// A skin; a candump log or MCAP recording (all parts of a split one, in any order); or buses. - is standard
-    /// input: a skin if an option for a skin is given, else traffic
+    /// What to check: a skin file, for its worst case; or traffic, from a candump log, an MCAP recording (all parts of
+    /// a split one) or live buses. - is standard input: a skin if --table, --format or --computation is given, else
+    /// traffic
     #[arg(value_name = "SKIN|FILE|BUS", required = true)]
     sources: Vec<PathBuf>,
-    /// Nominal bit rate (of identifiers and of whole classic frames) in bit/s: 1000000, 500k or 1M
+    /// Nominal bit rate in bit/s, used for identifiers and for whole classic frames, such as 1000000, 500k or 1M
     #[arg(long, value_name = "RATE", value_parser = parse_bit_rate)]
     nominal: Option<u32>,
-    /// Data bit rate of CAN FD frames that switch rates
+    /// Bit rate of the data in CAN FD frames with bit-rate switch
     #[arg(long, value_name = "RATE", value_parser = parse_bit_rate)]
     data: Option<u32>,
-    /// For a skin: print a table for common bit rates, regardless of the skin's rates
+    /// With a skin: print a table for common bit rates instead of using the skin's rates
     #[arg(long, conflicts_with = "nominal")]
     table: bool,
-    /// For a skin: frame format of packets on all buses, instead of the skin's formats
+    /// With a skin: assume this frame format on all buses, instead of the skin's formats
     #[arg(long, value_parser = one_of_values(FORMATS))]
     format: Option<Format>,
-    /// For a skin: longest time that a cell needs to compute its answer, in µs [the paper's cell: 68.5]
+    /// With a skin: longest time in µs that a cell needs to compute its answer [the paper's cell: 68.5]
     #[arg(long, value_name = "US", value_parser = parse_computation_ns)]
     computation: Option<u64>,
-    /// For traffic: bit rates of one bus; repeat the option for further buses: can0=500k/2M, can1=1M
+    /// With traffic: assumed bit rates of a bus, such as can0=500k/2M or can1=1M; repeat the option for further buses
     #[arg(long, value_name = "BUS=RATES", value_parser = rates_of_bus)]
     rates: Vec<(String, BitRates)>,
-    /// For traffic: the skin, for bit rates and the worst case [default: the skin attached to the recording]
+    /// With traffic: skin file for bit rates and the worst case [default: the skin in the recording]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// For traffic: also count bench-only frames: stimuli, sync and report with their answers, simulated wires
+    /// With traffic: also count frames that only a test bench sends (stimuli, sync, report, their answers, simulated
+    /// wires)
     #[arg(long)]
     bench_traffic: bool,
-    /// For traffic: share of bits that arrive damaged, 0 to 0.01 [default: 0]. Each causes an error frame and a
+    /// With traffic: assumed bit error rate, 0 to 0.01 [default: 0]; each damaged frame causes an error frame and a
     /// retransmission
     #[arg(long, value_name = "SHARE", allow_negative_numbers = true)]
     ber: Option<f64>,
-    /// For traffic: random seed for the damaged bits [default: 1]
+    /// With traffic: random seed for bit errors [default: 1]
     #[arg(long, value_name = "N", requires = "ber")]
     seed: Option<u64>,
-    /// For live buses: end after this time
+    /// With live buses: end the measurement after this time
     #[arg(long, value_name = "TIME", value_parser = parse_duration, allow_negative_numbers = true)]
     duration: Option<f64>,
     /// Print one JSON object; for traffic, one per frame instead of tables, in the order of the file
@@ -100,7 +102,8 @@ impl FitCommand {
         let file = skin.display();
         if let Some((option, _)) = of_traffic.iter().find(|(_, given)| *given) {
             return Err(Failure::usage_error(format!(
-                "{option} is only for traffic, but {file} is a skin: leave the option out"
+                "{option} is only for frames of a log, recording or bus, but {file} is a skin: leave the \
+                 option out"
             )));
         }
         if self.data.is_some() && self.nominal.is_none() {

@@ -31,7 +31,7 @@ use packets::PacketCommand;
 /// Time within which present cells send a heartbeat and their answers.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// Print a frame for cansend, with the right CRC; or send it
+/// Build a frame with the right CRC, and print it for cansend, or send it
 ///
 /// Prints one line for a CAN FD bus, two for a classic one. With --bus, --skin or a bus in --cell, sends the frame
 /// instead, also on an embedded bus, which cansend cannot use. Then waits for the answers to a configure and prints
@@ -46,13 +46,13 @@ const ANSWER_TIMEOUT: Duration = Duration::from_secs(1);
 pub(crate) struct FrameCommand {
     #[command(subcommand)]
     what: PacketCommand,
-    /// Frame format of the packet [default: with --skin the format of each bus, else fd]
+    /// Frame format of the packet [default: fd; with --skin, the format of each bus in the skin]
     #[arg(long, value_parser = one_of_values(FORMATS))]
     format: Option<Format>,
     /// Send the frame on these buses instead of printing it
     #[arg(long, value_name = "NAME", value_delimiter = ',')]
     bus: Vec<String>,
-    /// Send the frame on all buses of this skin, or on those that --bus names
+    /// Send the frame on all buses of this skin file, or only on those that --bus names
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
     #[command(flatten)]
@@ -202,8 +202,8 @@ fn report_answers(
             Some(_) => format!("{who} sent nothing"),
         };
         return Err(Failure::run_error(format!(
-            "{silent} on {bus} for {waited} s: `skinbus cells {bus}` lists the cells; if the bus has another frame \
-             format, use --format {other}"
+            "{silent} on {bus} for {waited} s: check the cells with `skinbus cells {bus}`; if the bus uses \
+             the other frame format, add --format {other}"
         )));
     }
     if tag.is_some() && lines.is_empty() {

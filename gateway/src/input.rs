@@ -229,13 +229,13 @@ pub(crate) fn no_frame_failure(reader: &Reader) -> Failure {
     let what = match (reader.format(), reader.line_count()) {
         (CaptureFormat::Candump, 0) => "the file is empty".to_owned(),
         (CaptureFormat::Candump, lines) => format!(
-            "no frame in {}; expected the output of candump, with lines like \
-             `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`",
+            "no frame in {}; expected the output of candump, with lines like `(1700000000.123456) vcan0 \
+             123#00` or `vcan0  123   [1]  00`",
             count_with_noun(lines, "line")
         ),
         (CaptureFormat::Mcap, _) => match describe_other_contents(reader) {
-            others if others.is_empty() => "it contains no frame".to_owned(),
-            others => format!("it contains no frame, only {others}"),
+            others if others.is_empty() => "it contains no CAN frames".to_owned(),
+            others => format!("it contains no CAN frames, only {others}"),
         },
     };
     Failure::run_error(format!("{name}: {what}"))
@@ -293,7 +293,7 @@ impl LossCounts {
         let said = [
             (self.lines, unread),
             (self.messages, format!("{} could not be read", count_with_noun(self.messages, "message"))),
-            (self.frames, format!("{} frames are missing: the recorder lost them", self.frames)),
+            (self.frames, format!("{} frames are missing, because the recorder lost them", self.frames)),
             (self.can_xl, format!("CAN XL frames are {can_xl}: {}", self.can_xl)),
         ];
         let said = said.iter().filter(|(count, _)| *count > 0).map(|(_, said)| said);
@@ -382,7 +382,7 @@ impl BusReceiver {
         let (name, missing) = (self.bus().name(), self.follower.dropped_frames());
         if missing > 0 {
             output::print_note(format_args!(
-                "{name}: {missing} frames are missing: they arrived faster than they were {done}"
+                "{name}: {missing} frames are missing, because they arrived faster than they were {done}"
             ));
         }
         missing

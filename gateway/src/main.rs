@@ -45,7 +45,7 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use protocol::usage::{Failure, exit_code, flush_printed, one_line_error};
 
-/// A test bench for robot skin on CAN: runs cells, bridges their bus to a control loop, records, replays
+/// A test bench for robot skin on CAN: runs cells and a control loop, records and replays their frames
 #[derive(Debug, Parser)]
 #[command(name = "skinbus", version, disable_help_subcommand = true)]
 struct Arguments {

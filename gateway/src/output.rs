@@ -109,7 +109,7 @@ pub(crate) fn check_distinct_files<'a>(
         if read.contains(&there) {
             let name = option_and_path(option, path);
             return Err(Failure::usage_error(format!(
-                "{name} is a file that this command reads: name another file"
+                "{name} is also an input of this command: name another file for the output"
             )));
         }
         if let Some((other, _)) = before.iter().find(|(_, place)| *place == there) {

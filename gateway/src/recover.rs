@@ -20,9 +20,9 @@ use super::output::{OverwriteOption, check_distinct_files, print_beside_files};
 #[derive(Args, Debug)]
 #[command(after_help = "Example:\n  skinbus recover run.mcap.part -o run.mcap")]
 pub(crate) struct RecoverCommand {
-    /// Recording to repair: an MCAP file, also of another program
+    /// MCAP recording to repair; those of other programs are accepted too
     file: PathBuf,
-    /// The new file [default: FILE-recovered.mcap]
+    /// File to write [default: FILE-recovered.mcap]
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]
@@ -41,7 +41,7 @@ impl RecoverCommand {
         }
         if self.output.is_none() && self.file.as_os_str() == "-" {
             return Err(Failure::usage_error(
-                "-: standard input has no name to derive the new file from: name the new file with -o",
+                "the recording comes from standard input, which has no name: name the new file with -o",
             ));
         }
         let output = self.output.unwrap_or_else(|| names::recovered_name(&names::final_name(&self.file)));
@@ -73,7 +73,7 @@ impl RecoverCommand {
         };
         if recovered.lost_more_than_kept() {
             return Err(Failure::run_error(format!(
-                "only a part of {name} could be recovered, and most of it is lost: {line}"
+                "most of {name} is lost, only a part could be recovered: {line}"
             )));
         }
         print_beside_files([Some(output.as_path())], &format!("{}\n", printable(&line)))

@@ -47,7 +47,7 @@ const SEND_TIMEOUT_MS: u32 = 100;
   skinbus replay run.mcap run-*.mcap --expect --spawn --lockstep
   skinbus replay foreign.log --map can0=vcan0 --speed max --loop 10")]
 pub(crate) struct ReplayCommand {
-    /// A candump log or an MCAP recording; the parts of a split recording are read as one, in any order
+    /// Candump log or MCAP recording to send; the parts of a split recording are read as one, in any order
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
     #[command(flatten)]
@@ -56,31 +56,32 @@ pub(crate) struct ReplayCommand {
     time: BusTimeOption,
     #[command(flatten)]
     frames: FrameOptions,
-    /// Repeat N times; 0 repeats until Ctrl-C
+    /// Send everything N times; 0 repeats until Ctrl-C
     #[arg(long = "loop", value_name = "N", default_value_t = 1)]
     passes: u32,
-    /// Speed factor, 0.1 to 100; or max to send as fast as the bus accepts frames, whatever their times
+    /// Speed relative to the recorded times, 0.1 to 100; or max, to send as fast as the bus accepts frames
     #[arg(long, value_name = "X", default_value = "1", value_parser = speed, allow_negative_numbers = true)]
     speed: ReplaySpeed,
-    /// Send a joints message only after every cell has answered the previous one: gives the same result on any machine
+    /// Send each joints message only after every cell has answered the one before, so that the result does not depend
+    /// on the machine
     #[arg(long)]
     lockstep: bool,
-    /// Compare the answers with the recorded ones; --speed max then implies --lockstep
+    /// Compare the cells' answers with the recorded ones; with --speed max this implies --lockstep
     #[arg(long)]
     expect: bool,
-    /// Accept and count differences between torque words of up to this many steps of 1/4096 Nm
+    /// Accept torques that differ by up to this many steps of 1/4096 Nm, and count them
     #[arg(long, value_name = "STEPS", default_value_t = 0, requires = "expect")]
     tolerance: u16,
     /// Start the cells as processes, and end them afterwards
     #[arg(long)]
     spawn: bool,
-    /// The skin of the started cells [default: the recording's own]
+    /// Skin file of the started cells [default: the skin in the recording]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// Switch measuring cells to test mode for the replay, so that they obey stimuli
+    /// Switch cells that use their own sensors to test mode, so that they use the recorded stimuli instead
     #[arg(long)]
     test_mode: bool,
-    /// Write the final figures as JSON, - for standard output; docs/how-to/replay.md explains the keys
+    /// Write the results as JSON, - for standard output; docs/how-to/replay.md explains the keys
     #[arg(long, value_name = "FILE")]
     summary: Option<PathBuf>,
     #[command(flatten)]
@@ -92,7 +93,7 @@ pub(crate) struct ReplayCommand {
 /// Output options of a replay.
 #[derive(Args, Debug)]
 struct OutputOptions {
-    /// Show no progress, only the table at the end
+    /// Show only the table at the end, without progress
     #[arg(long, short)]
     quiet: bool,
 }
@@ -100,27 +101,27 @@ struct OutputOptions {
 /// Options for the selection and the destination of frames.
 #[derive(Args, Debug)]
 struct FrameOptions {
-    /// Send the frames of one of the capture's buses on another bus
+    /// Send the frames of the recorded bus FROM on the bus TO
     #[arg(long, value_name = "FROM=TO", value_parser = parse_route)]
     map: Vec<(String, String)>,
-    /// Send only the frames of these buses of the capture
+    /// Send only frames of these recorded buses
     #[arg(long, value_name = "NAME", value_delimiter = ',')]
     bus: Vec<String>,
     /// Send only these frames: inputs are commands, configuration and stimuli. Default: inputs with --expect,
     /// --lockstep or --spawn, else all
     #[arg(long, value_parser = one_of_values(SENDER_FILTERS))]
     only: Option<SenderFilter>,
-    /// Begin at this time: seconds since the start of the run, or of a log since its first frame. If only inputs are
-    /// sent, the cells are first brought into the state that they had then
+    /// Begin at this time: seconds since the start of the run, or since the first frame of a log. If only inputs are
+    /// sent, the cells are first set to the state that they had at this time
     #[arg(long, value_name = "S", value_parser = parse_time_ns, allow_negative_numbers = true)]
     from: Option<u64>,
-    /// End before this second, counted like --from
+    /// End before this time, in seconds as for --from
     #[arg(long, value_name = "S", value_parser = parse_time_ns, allow_negative_numbers = true)]
     to: Option<u64>,
 }
 
 const SENDER_FILTERS: &[OptionValue<SenderFilter>] = &[
-    ("inputs", "Commands, configuration, stimuli", SenderFilter::Inputs),
+    ("inputs", "Commands, configuration and stimuli", SenderFilter::Inputs),
     ("replies", "Frames from cells", SenderFilter::Replies),
     ("all", "Everything", SenderFilter::All),
 ];
@@ -128,7 +129,7 @@ const SENDER_FILTERS: &[OptionValue<SenderFilter>] = &[
 fn parse_route(text: &str) -> Result<(String, String), String> {
     match text.split_once('=') {
         Some((from, to)) if !from.is_empty() && !to.is_empty() => Ok((from.to_owned(), to.to_owned())),
-        _ => Err("use a bus of the capture and the bus to send it on, such as vcan0=vcan1".to_owned()),
+        _ => Err("use a recorded bus and the bus to send its frames on, such as vcan0=vcan1".to_owned()),
     }
 }
 
@@ -224,15 +225,19 @@ fn table(summary: &Summary, is_coloured: bool) -> String {
     };
     rows.add_section("frames", "", "");
     rows.add_row("sent", summary.sent, "");
-    rows.add_row_unless_zero("refused", summary.refused, "a bus stayed full");
+    rows.add_row_unless_zero("refused", summary.refused, "the queue of a bus stayed full");
     rows.add_row_unless_zero("lost", summary.lost, "a bus was down");
     for (reason, count) in &summary.skipped {
         rows.add_row("not sent", count, reason);
     }
-    rows.add_row_unless_zero("sent at once", summary.sent_at_once, "older than frames sent before");
+    rows.add_row_unless_zero("sent without delay", summary.sent_at_once, "their time stamps go backwards");
     if let (Some(late), Some(idle)) = (&summary.late_us, &summary.idle_late_us) {
         rows.add_section("lateness", "50 % / 90 % / 99 % / max, µs", "");
-        rows.add_row("frames sent", format_quantiles(late), format!("idle {}", format_quantiles(idle)));
+        rows.add_row(
+            "frames sent",
+            format_quantiles(late),
+            format!("idle machine: {}", format_quantiles(idle)),
+        );
     }
     if summary.buses.len() > 1 || summary.buses.iter().any(|bus| bus.capture != bus.name) {
         for bus in &summary.buses {
@@ -268,7 +273,7 @@ fn comparison_rows(rows: &mut KeyValueTable, expect: &ReplyComparison) {
     difference_rows(rows, "sum", &tally.sum_words, 1);
     let late = match expect.joints_skipped {
         0 => String::new(),
-        skipped => format!("joints messages that reached cells too late: {skipped}"),
+        skipped => format!("cells skipped {skipped} late joints messages"),
     };
     rows.add_row("missing", tally.missing, late);
     rows.add_row("extra", tally.extra, "");
@@ -279,12 +284,12 @@ fn comparison_rows(rows: &mut KeyValueTable, expect: &ReplyComparison) {
     rows.add_row_unless_zero(
         "lost by the recorder",
         expect.recording_dropped,
-        "the replay lacks the inputs among them",
+        "inputs among them could not be sent",
     );
     rows.add_row_unless_zero(
         "unknown configurations",
         expect.unchecked_cells,
-        "they were changed before they were recorded",
+        "changed before the recording began",
     );
 }
 

@@ -14,7 +14,7 @@ use protocol::wire_time::parse_bit_rate;
 use super::input::{first_skin_difference, read_skin};
 use super::output::{OverwriteOption, check_distinct_files, is_standard_output, print_note};
 
-/// Report on a recorded run: one HTML page with figures, beside the paper's numbers
+/// Write a report on a recorded run: an HTML page with figures, compared with the paper's
 ///
 /// The page is self-contained, without network access or scripts, and readable on a phone, on a dark screen and on
 /// paper. For a recording that was cut off, the report covers the intact part, and names what is missing on the page
@@ -27,23 +27,23 @@ use super::output::{OverwriteOption, check_distinct_files, is_standard_output, p
   skinbus report run.mcap run-*.mcap -o all.html
   skinbus report run.log --skin skin.toml -o - > log.html")]
 pub(crate) struct ReportCommand {
-    /// The recording of a run, as written by `skinbus run SKIN --record FILE`; all parts of a split one, in any order.
-    /// Or frames only: a candump log, or another program's MCAP file
+    /// Recording of a run, from `skinbus run SKIN --record FILE` (all parts of a split one, in any order); or a candump
+    /// log or another program's MCAP file, for a shorter report
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
-    /// The skin of a candump log; a recording contains its own
+    /// Skin file, needed only for a candump log: a recording contains its skin
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// The HTML page to write; - for standard output [default: the recording's name with .html]
+    /// HTML page to write; - for standard output [default: the recording's name with .html]
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// Also write each figure as an SVG file into this directory, which is created if necessary
     #[arg(long, value_name = "DIR")]
     svg: Option<PathBuf>,
-    /// Nominal bit rate of all buses, for the bus load: 500k, 1M [default: the skin's, else 1M]
+    /// Nominal bit rate for the bus load, such as 500k or 1M [default: the skin's, else 1M]
     #[arg(long, value_name = "RATE", value_parser = parse_bit_rate)]
     nominal: Option<u32>,
-    /// Data bit rate of FD frames: 2M, 5M [default: the skin's, else 5M]
+    /// Data bit rate of FD frames for the bus load, such as 2M or 5M [default: the skin's, else 5M]
     #[arg(long, value_name = "RATE", value_parser = parse_bit_rate)]
     data: Option<u32>,
     #[command(flatten)]
@@ -128,8 +128,8 @@ fn report_failure(error: ReportError, skin: Option<&(String, Skin)>) -> Failure 
             let first =
                 first.map_or_else(String::new, |(what, is, was)| format!(" ({what}: {is}, recorded: {was})"));
             Failure::usage_error(format!(
-                "{name} was recorded with a skin that differs from {file}{first}; leave --skin out: the recording \
-                 contains its skin"
+                "{name} was recorded with a skin that differs from {file}{first}: leave out --skin, because \
+                 the recording contains its skin"
             ))
         }
         (error, _) => Failure::usage_error(error),

@@ -54,20 +54,20 @@ struct CommonOptions {
     /// End after this time: 10, 10s or 2min [default: the scenario's duration, or 10s]
     #[arg(long, value_name = "TIME", value_parser = parse_duration, allow_negative_numbers = true)]
     duration: Option<f64>,
-    /// Write the final figures as JSON, also if the run fails; docs/reference/summary.md explains the keys
+    /// Write the results as JSON, even if the run fails; docs/reference/summary.md explains the keys
     #[arg(long, value_name = "FILE")]
     summary: Option<PathBuf>,
-    /// Show no progress, only the table at the end
+    /// Show only the table at the end, without progress
     #[arg(long, short)]
     quiet: bool,
-    /// Print all rows of the table, including those with usual values
+    /// Print all rows of the table, including those whose values are as expected
     #[arg(long, short)]
     verbose: bool,
     /// Show the skin live in a browser, on a page that is served until the run ends; see docs/how-to/view.md. Without
     /// --duration, the run then ends only with Ctrl-C
     #[arg(long)]
     view: bool,
-    /// Address of the page [default: any free port of this machine]
+    /// Address at which the page is served [default: any free port of this machine]
     #[arg(long, value_name = "ADDRESS:PORT", requires = "view")]
     listen: Option<SocketAddr>,
     #[command(flatten)]
@@ -84,8 +84,7 @@ struct RunTexts {
 /// Options for a recording, besides candump text.
 #[derive(Args, Debug)]
 struct RecordingArguments {
-    /// Record everything as MCAP: frames, joints, torques, touches, timing; docs/reference/recording.md lists the
-    /// topics
+    /// Record the run as MCAP: frames, joints, torques, touches, timing; docs/reference/recording.md lists the topics
     #[arg(long, value_name = "FILE.mcap")]
     record: Option<PathBuf>,
     #[command(flatten)]
@@ -186,44 +185,43 @@ pub(crate) struct DemoCommand {
   skinbus run gateway/examples/ur5-253.toml --scenario gateway/examples/demo.toml
   skinbus run skin.toml --duration 60 --no-spawn --candump run.log --summary run.json")]
 pub(crate) struct RunCommand {
-    /// The skin
+    /// Skin file (TOML) that describes the robot, buses and cells
     skin: PathBuf,
-    /// The scenario: touches, motion, faults [default: nothing touches the skin]
+    /// Scenario file (TOML): touches, motion and faults [default: nothing touches the skin]
     #[arg(long, value_name = "FILE")]
     scenario: Option<PathBuf>,
     #[command(flatten)]
     common: CommonOptions,
-    /// Start a new file of the recording (FILE-1.mcap, ...) at this size or age: 500MB, 2GiB, 90s, 10min; may be given
-    /// twice
+    /// Split the recording: start a new file (FILE-1.mcap, ...) at this size or age, such as 500MB, 2GiB, 90s or 10min;
+    /// give it twice for both
     #[arg(long, value_name = "SIZE|TIME", requires = "record", value_parser = limit)]
     record_split: Vec<SplitLimit>,
     #[command(flatten)]
     processes: ProcessOptions,
     #[command(flatten)]
     page: PageOptions,
-    /// Write all frames as candump text: a log that can be followed while it grows
+    /// Write all frames to a candump log, which `tail -f` can follow during the run
     #[arg(long, value_name = "FILE")]
     candump: Option<PathBuf>,
     #[command(flatten)]
     kinds: BusKinds,
     #[command(flatten)]
     time: BusTimeOption,
-    /// Read commands from standard input and write events to standard output, for a program that presses cells;
-    /// docs/reference/control.md describes them. The run ends at the end of the input, or after --duration [default: a
-    /// day]
+    /// Let a program control the run: read commands from standard input, and write events to standard output;
+    /// docs/reference/control.md describes them. The run ends when the input ends, or after --duration [default: a day]
     #[arg(long)]
     control: bool,
-    /// Start no cells: real ones, or ones that run already, are on the bus
+    /// Do not start cells, because real or simulated cells are already on the buses
     #[arg(long)]
     no_spawn: bool,
-    /// Let cells keep their parameters in files of this directory
+    /// Keep the parameters of the started cells in files in this directory, as in flash
     #[arg(long, value_name = "DIR")]
     flash: Option<PathBuf>,
     /// Firmware of a cell (for the micro:bit) that emulated cells run; docs/how-to/firmware.md explains how to build it
     #[arg(long, value_name = "ELF", requires = "emulate")]
     firmware: Option<PathBuf>,
-    /// Cells that run the firmware in QEMU instead of as a process, by node id or as BUS:NODE. They are commissioned,
-    /// keep their flash in files like other cells, and end with the run
+    /// Run these cells, given by node id or as BUS:NODE, as firmware in QEMU instead of as processes. They are
+    /// commissioned at the start, keep their flash in files like other cells, and end with the run
     #[arg(
         long,
         value_name = "[BUS:]N,...",
@@ -256,9 +254,9 @@ impl DemoCommand {
         let place = options.directory.as_ref();
         let place = place.map(|path| format!("SKINBUS_DIR={} ", shell_quoted_os(path.as_os_str())));
         let place = place.filter(|_| !kind.is_interface()).unwrap_or_default();
-        options
-            .announced
-            .push(format!("to see the decoded frames: {place}skinbus dump vcan0 --bus-kind {kind}"));
+        options.announced.push(format!(
+            "to see the decoded frames, run in another shell: {place}skinbus dump vcan0 --bus-kind {kind}"
+        ));
         let CommonOptions { recording, summary, verbose, view, listen, .. } = self.common;
         let numbered = self.candump.is_none();
         let path = self.candump.unwrap_or_else(|| DEMO_LOG.into());

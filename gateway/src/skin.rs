@@ -18,8 +18,8 @@ use super::output::OverwriteOption;
 pub(crate) use show::still_page;
 
 const REPLIES: &[OptionValue<Answers>] = &[
-    ("torque", "Each cell sends its own torque", Answers::Torque),
-    ("sum", "Cells send sums along the tree", Answers::Sum),
+    ("torque", "Each cell sends its own torques to the gateway", Answers::Torque),
+    ("sum", "Cells add torques along a tree of wires; only its roots send sums to the gateway", Answers::Sum),
 ];
 
 /// Create and draw skins, and convert them to URDF and DBC
@@ -49,19 +49,19 @@ struct GenerateCommand {
     /// Number of cells, 1 to 254 per bus
     #[arg(long, default_value_t = 253)]
     cells: usize,
-    /// Number of buses; cells of one bus are placed together
+    /// Number of buses; the cells of a bus lie side by side on the arm
     #[arg(long, default_value_t = 1)]
     buses: usize,
-    /// Joint broadcasts per second; must divide the 500 Hz of the control loop
+    /// Rate of joint broadcasts in Hz; must divide the 500 Hz of the control loop
     #[arg(long, default_value_t = 62.5)]
     broadcast_hz: f64,
-    /// Kind of reply that the cells send
+    /// What the cells reply to joint broadcasts
     #[arg(long, value_parser = one_of_values(REPLIES), default_value = "torque")]
     reply: Answers,
     /// Frame format of the cells' packets
     #[arg(long, value_parser = one_of_values(FORMATS), default_value = "fd")]
     format: Format,
-    /// The file to write, completely or not at all [default: standard output]
+    /// Output file; after an error, no incomplete file is left [default: standard output]
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]

@@ -55,30 +55,31 @@ const DEFAULT_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHO
   skinbus view run.log --skin skin.toml
   skinbus view skin.toml --listen 0.0.0.0:8100 --token-file token --read-only")]
 pub(crate) struct ViewCommand {
-    /// A skin, to show all its buses; or some of its buses, with --skin; or a candump log or MCAP recording (all parts
-    /// of a split one, in any order)
+    /// What to show: a skin file, for all its live buses; names of some of its buses, with --skin; or a candump log or
+    /// MCAP recording (all parts of a split one, in any order)
     #[arg(required = true, value_name = "SKIN|BUS|FILE")]
     sources: Vec<PathBuf>,
-    /// The skin of named buses or of a recording [default: the skin in the recording]
+    /// Skin file of the buses, or of a recording [default: the skin in the recording]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// Show one moment instead of playing: seconds since the start of the run, or of a log since its first frame
+    /// Show only this moment of a recording: seconds since the start of the run, or since the first frame of a log
     #[arg(long, value_name = "S", value_parser = parse_time_ns)]
     at: Option<u64>,
-    /// Address of the page; port 0 is any free port
+    /// Address at which the page is served; port 0 stands for any free port
     #[arg(long, value_name = "ADDRESS:PORT", default_value_t = DEFAULT_ADDRESS)]
     listen: SocketAddr,
-    /// Read the token in the page's address from this file [default: the variable SKINBUS_TOKEN, else random]
+    /// Read the secret token of the page's address from this file [default: the variable SKINBUS_TOKEN, else a random
+    /// token]
     #[arg(long, value_name = "FILE")]
     token_file: Option<PathBuf>,
-    /// Also write the page's address to this file, for scripts: only you can read it, and it is removed with the page;
-    /// - is standard output
+    /// Write the page's address to this file, for scripts; only you can read the file, and it is deleted when the page
+    /// ends; - for standard output
     #[arg(long, value_name = "FILE")]
     address_file: Option<PathBuf>,
-    /// Let pages only show the bench: they cannot press cells, halt or resume
+    /// Let pages only watch: they cannot press cells, halt or resume the robot
     #[arg(long)]
     read_only: bool,
-    /// Wait for buses that do not exist yet
+    /// If a bus does not exist yet, wait for it instead of failing
     #[arg(long)]
     wait: bool,
     /// Serve the run that started this program: accept connections on the listener at standard input, exchange commands
@@ -94,11 +95,12 @@ pub(crate) struct ViewCommand {
 /// Options of a run's page.
 #[derive(Args, Debug, Default)]
 pub(crate) struct PageOptions {
-    /// Also write the page's address to this file, for scripts: only you can read it, and it is removed with the page;
-    /// - is standard output
+    /// Write the page's address to this file, for scripts; only you can read the file, and it is deleted when the page
+    /// ends; - for standard output
     #[arg(long, value_name = "FILE", requires = "view")]
     address_file: Option<PathBuf>,
-    /// Read the token in the page's address from this file [default: the variable SKINBUS_TOKEN, else random]
+    /// Read the secret token of the page's address from this file [default: the variable SKINBUS_TOKEN, else a random
+    /// token]
     #[arg(long, value_name = "FILE", requires = "view")]
     token_file: Option<PathBuf>,
 }
@@ -139,11 +141,12 @@ impl ViewCommand {
             [one, ..] if !one.exists() => self.skin_on_named_buses()?,
             [one] if self.skin.is_none() && self.at.is_none() => self.read_skin_with_meshes(one)?,
             [one] => {
-                let why = "is only for a recording or a bus, but this file is a skin: leave it out";
+                let why = "is only for a recording or a bus, but this file is a skin: leave the option out";
                 return Err(Failure::usage_error(format!("{}: --skin or --at {why}", one.display())));
             }
             _ => {
-                let why = "several files must be the parts of one recording, but the first is a skin: name it alone";
+                let why = "only the parts of one recording can be shown together, but the first file is a \
+                           skin: name only the skin";
                 return Err(Failure::usage_error(why));
             }
         };
@@ -225,8 +228,8 @@ impl ViewCommand {
                 let skin = skin_of_recording(&self.sources)?;
                 if skin.robot.urdf.is_some() {
                     print_note(
-                        "the recording does not contain the robot's meshes: to show them, name with --skin the skin \
-                         beside its URDF",
+                        "the recording does not contain the robot's meshes: to show them, add --skin with \
+                         the skin file that lies beside the URDF",
                     );
                 }
                 Ok((skin, Vec::new()))

@@ -140,11 +140,11 @@ impl<'a> CellList<'a> {
         });
         let shared: Vec<_> = shared.collect();
         if !shared.is_empty() {
-            text += &format!("node ids used by two cells: {}\n", abbreviate_names(&shared));
+            text += &format!("node ids that two cells use: {}\n", abbreviate_names(&shared));
         }
         let missing: Vec<_> = self.missing.iter().flatten().map(u8::to_string).collect();
         if !missing.is_empty() {
-            text += &format!("missing cells of {}: {}\n", self.file, abbreviate_names(&missing));
+            text += &format!("cells in {} that sent nothing: {}\n", self.file, abbreviate_names(&missing));
         }
         text
     }

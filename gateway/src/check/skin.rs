@@ -123,10 +123,10 @@ fn describe(skin: &Skin) -> String {
     }
     for [first, second] in coincident_cells(skin) {
         let name = |cell: &Cell| format!("{} on {}", cell.node, bus_name(skin, cell));
-        text += &format!("remark: cells {} and {} have the same position\n", name(first), name(second));
+        text += &format!("note: cells {} and {} have the same position\n", name(first), name(second));
     }
     text + &format!(
-        "hash: {:04X} over the parameters of all cells; --list shows the hash of each cell\n",
+        "hash: {:04X} of the parameters of all cells; --list shows the hash of each cell\n",
         hash(skin)
     )
 }

@@ -73,16 +73,16 @@ impl<'a> DisplayedBus<'a> {
     }
 
     fn add_rows(&self, rows: &mut KeyValueTable) {
-        let cells = format!("{} described", count_with_noun(self.cells.len(), "cell"));
+        let cells = format!("{} in the skin", count_with_noun(self.cells.len(), "cell"));
         let others = match self.unknown_nodes.len() {
             0 => String::new(),
-            1 => "1 cell not described, left unchanged".to_owned(),
-            count => format!("{count} cells not described, left unchanged"),
+            1 => "1 cell not in the skin, left unchanged".to_owned(),
+            count => format!("{count} cells not in the skin, left unchanged"),
         };
         rows.add_section(format!("{} ({})", self.name, self.kind), cells, others);
         let compared = "read back, and compared word by word";
         rows.add_row_unless_zero("written", self.written, compared);
-        let by_hash = "according to their hash; --verify reads them back";
+        let by_hash = "judged by their hash; --verify reads them back";
         rows.add_row_unless_zero("already correct", self.already_so, by_hash);
         rows.add_row_unless_zero("already correct, verified", self.verified, compared);
         rows.add_row_unless_zero("would be written", self.would_write, "");
@@ -104,10 +104,10 @@ impl<'a> DisplayedBus<'a> {
         rows.add_row_unless_zero(
             "with a different node id",
             moved,
-            "than described; --node-ids writes a copy with the actual ids",
+            "than in the skin; --node-ids writes a copy with the actual ids",
         );
         rows.add_row_unless_zero("requests", self.requests, format!("{} retries", self.repeated));
-        let why = "they arrived faster than they were read";
+        let why = "this program did not read them in time";
         rows.add_row_unless_zero("frames lost", self.frames_dropped, why);
     }
 }

@@ -118,7 +118,7 @@ impl ComparisonText<'_> {
         row("joints", none(), none(), replies_text(&only_joints));
         let touched = [contacts.only.only_a, contacts.only.only_b].map(|only| contacts.both + only);
         let [in_a, in_b] = touched.map(|touched| touched.to_string());
-        row("touched cells x epochs", in_a, in_b, format!("{} in both", contacts.both));
+        row("cells touched, per epoch", in_a, in_b, format!("{} in both", contacts.both));
         for (name, replies, a, b) in
             [("torques", torques, a.torques, b.torques), ("sums", sums, a.sums, b.sums)]
         {
@@ -134,16 +134,16 @@ impl ComparisonText<'_> {
         let at = |of: fn(&Quantiles) -> f64, source: &CaptureFigures| {
             format_decimals(source.reply_us.as_ref().map(of), 0, "-")
         };
-        let information = || "information only".to_owned();
+        let information = || "not compared".to_owned();
         row("reply, 50 %, µs", at(|it| it.p50, a), at(|it| it.p50, b), information());
         row("reply, 99 %, µs", at(|it| it.p99, a), at(|it| it.p99, b), information());
         for (name, of) in [
             ("late replies", (|it| it.late) as fn(&CaptureFigures) -> u64),
             ("lost packets", |it| it.lost),
             ("restarts of cells", |it| it.restarts),
-            ("frames lost by recorder", |it| it.dropped),
+            ("frames not recorded", |it| it.dropped),
             ("joints messages out of order", |it| it.out_of_order),
-            ("restarts of the numbering", |it| it.countings.saturating_sub(1).into()),
+            ("epoch count restarted", |it| it.countings.saturating_sub(1).into()),
         ] {
             if of(a) + of(b) > 0 {
                 row(name, of(a).to_string(), of(b).to_string(), information());
@@ -220,18 +220,21 @@ impl ComparisonText<'_> {
             let _ = writeln!(text, "  {letter}  {time}{has}");
         }
         if let Some(steps) = first.steps {
-            let _ = writeln!(text, "  {} apart", count_with_noun(steps, "step"));
+            let _ = writeln!(text, "  the difference is {}", count_with_noun(steps, "step"));
         }
         if first.cell.is_some() && *what != "contact" {
             let inputs = match (first.inputs.as_slice(), first.unknown_inputs.as_slice()) {
                 ([], []) => "the inputs are the same: joints, halt, stimulus, configuration".to_owned(),
                 ([], unknown) => {
-                    format!("no known input differs; unknown inputs: {}", comma_separated(unknown))
+                    format!(
+                        "the known inputs are the same; not in the captures: {}",
+                        comma_separated(unknown)
+                    )
                 }
                 (inputs, []) => format!("different inputs: {}", comma_separated(inputs)),
                 (inputs, unknown) => {
                     format!(
-                        "different inputs: {}; unknown inputs: {}",
+                        "different inputs: {}; not in the captures: {}",
                         comma_separated(inputs),
                         comma_separated(unknown)
                     )
@@ -254,12 +257,12 @@ impl ComparisonText<'_> {
     fn tolerance_hint(&self, first: &FirstDifference) -> Option<&'static str> {
         match (first.what, first.steps) {
             ("joints", Some(_)) => Some(
-                "the motion depends on the times of ticks: use kind = \"hold\", or allow steps with \
-                 --joints-tolerance and --tolerance",
+                "the motion depends on the times of the control loop's ticks: use kind = \"hold\" in the \
+                 scenario, or accept differences with --joints-tolerance and --tolerance",
             ),
             ("torque" | "sum" | "joints", None) if first.how.starts_with("missing") => Some(
-                "on a busy machine, a cell skips joints messages that it received too late: --allow-missing N accepts \
-                 some",
+                "on a busy machine, cells skip joints messages that they receive too late: --allow-missing N \
+                 accepts N missing replies",
             ),
             _ => None,
         }

@@ -78,7 +78,7 @@ impl ConvertCommand {
         missing.print_counts(&reader, "left out");
         if let Some(buses) = buses_with_sums(&skin) {
             print_note(format_args!(
-                "{name}: the cells on {buses} answer with sums: distributed torques and errors are NaN"
+                "{name}: the cells on {buses} answer with sums, so distributed torques and errors are NaN"
             ));
         }
         let (frames, epochs) = (accounts.frames, accounts.epochs);

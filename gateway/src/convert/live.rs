@@ -218,7 +218,8 @@ pub(super) fn check_part_file(path: &Path) -> io::Result<()> {
             part.display()
         ))),
         Ok(_) => Err(io::Error::other(format!(
-            "{0} was left by a program that was killed: recover it with `skinbus recover {0}`, then move it away",
+            "{0} was left by a conversion that was killed: recover it with `skinbus recover {0}`, then move \
+             it away",
             part.display()
         ))),
         Err(_) => Ok(()),

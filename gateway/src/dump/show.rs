@@ -177,7 +177,7 @@ impl<W: Write> FrameOutput<W> {
             let (name, _, chain) = self.described.remove(at);
             let another = other_robot_text(&name, came, chain);
             print_note(format_args!(
-                "{another}; from here on, torques on this bus are read as Q3.12 and joints as revolute"
+                "{another}; from here on, torques on this bus are decoded as Q3.12 and joints as revolute"
             ));
             self.bus = Arc::from("");
         }

@@ -25,7 +25,12 @@ pub(super) fn report_text(
     let mut rows = KeyValueTable::new(name, head, print::count_with_noun(report.frames, "frame"));
     rows.add_row_unless_zero("frames out of order", report.times_backwards, "earlier than the frame before");
     rows.add_row_unless_zero("frames missing", report.dropped, "lost by the recorder");
-    rows.add_row_unless_zero("frames of further buses", report.frames_of_other_buses, "beyond the first 64");
+    rows.add_row_unless_zero(
+        "frames of other buses",
+        report.frames_of_other_buses,
+        "only the first 64 \
+                                                                                       buses are shown",
+    );
     for bus in &report.buses {
         bus_rows(&mut rows, bus, report.duration_s);
     }
@@ -72,7 +77,7 @@ fn bus_rows(rows: &mut KeyValueTable, bus: &BusReport, duration_s: f64) {
     rows.add_row_unless_zero(
         "simulated wires",
         bus.wires,
-        format!("{}, not on a real bus", rate_text(bus.wires_per_s, bus.wires_span_s)),
+        format!("{}; a real bus has none", rate_text(bus.wires_per_s, bus.wires_span_s)),
     );
     let refused: Vec<_> =
         bus.refused.counts_by_reason().into_iter().filter(|(_, count)| *count > 0).collect();
@@ -86,7 +91,7 @@ fn bus_rows(rows: &mut KeyValueTable, bus: &BusReport, duration_s: f64) {
     rows.add_row_unless_zero("  error frames", error, comma_separated(error_counts(&bus.foreign)));
     if packets_by_chance >= 0.05 {
         let chance = format!("{packets_by_chance:.1}");
-        rows.add_row("  packets by chance", chance, "expected number");
+        rows.add_row("  valid CRC by chance", chance, "expected number");
     }
     let why = if bus.dropped > 0 { "lost by the recorder" } else { "" };
     rows.add_row("frames missing", bus.dropped, why);

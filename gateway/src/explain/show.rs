@@ -45,7 +45,7 @@ pub(super) fn format_explanation(
     let is_finest = explanation.buses.iter().all(|bus| bus.torque_format == finest);
     match (what, cells.as_slice()) {
         (ExplainDetail::All | ExplainDetail::Cells, []) => {
-            text += "\nno cell was in contact, and none answered\n"
+            text += "\nno cell was in contact, and no cell answered\n"
         }
         (ExplainDetail::Joint, _) => text += &format_joint(cells),
         (ExplainDetail::Cells, _) | (ExplainDetail::All, [_]) => {
@@ -209,17 +209,19 @@ fn verdict_info(verdict: &WordVerdict) -> (u8, &'static str, Option<String>) {
     match verdict {
         WordVerdict::Nearest => (0, "nearest", None),
         WordVerdict::Rounded { .. } => {
-            let means = "a J this many steps of 2^-14 m from the exact one gives this word";
+            let means =
+                "a Jacobian J that is this many steps of 2^-14 m off, by 16-bit rounding, gives this word";
             (1, "16 bits", Some(means.to_owned()))
         }
         WordVerdict::Saturated => {
-            let means = "the product is beyond the range of the torque format: the word is saturated";
+            let means = "J F_z is beyond the range of the torque format, so the word is at its limit";
             (2, "saturated", Some(means.to_owned()))
         }
         WordVerdict::Open => (3, "unknown", None),
         WordVerdict::Unexplained => {
             let means = format!(
-                "no J within {MAX_JACOBIAN_ERROR_STEPS} steps of the exact one, plus one step for each row after the sixth, gives this word"
+                "no Jacobian J within the allowed error gives this word ({MAX_JACOBIAN_ERROR_STEPS} steps, \
+                 and one more for each row after the sixth)"
             );
             (4, "NOT EXPLAINED", Some(means))
         }
@@ -257,7 +259,7 @@ fn format_cell_steps(cell: &CellExplanation, zero: u64) -> String {
     }
     match cell.answered_after_ns {
         Some(nanos) => text += &format!("  answered   {} after the joints message\n", format_millis(nanos)),
-        None => text += "  answered   nothing\n",
+        None => text += "  answered   not at all\n",
     }
     text + &format_joint_rows(std::slice::from_ref(cell), false)
 }
@@ -303,7 +305,7 @@ fn format_force_origin(origin: &ContactOrigin, zero: u64) -> String {
 
 fn format_joint(cells: &[CellExplanation]) -> String {
     if cells.is_empty() {
-        return "\nno cell was in contact, and none answered\n".to_owned();
+        return "\nno cell was in contact, and no cell answered\n".to_owned();
     }
     format!("\n{}", format_joint_rows(cells, true))
 }
@@ -362,7 +364,7 @@ fn format_joint_totals(total: &[JointTorqueTotal], is_finest: bool) -> String {
         ]
     });
     format!(
-        "\nthe whole skin: sums of the words in the frames, and the central computation\n{}",
+        "\ntorques of the whole skin: sum of the words in the frames, and central computation\n{}",
         table(head.map(str::to_owned).to_vec(), lines, false)
     )
 }

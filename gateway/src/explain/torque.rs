@@ -29,14 +29,14 @@ const COLUMNS: Columns = Columns { needed: &["cell", "force_n", "q"], optional: 
 /// Options for a force on a cell, or rows of them.
 #[derive(Args, Debug)]
 pub(super) struct TorqueOptions {
-    /// Compute the torques of a force against the cell's outward normal, from 0 to 95.997 N, which is what its three
-    /// contact sensors can report
+    /// Compute the torques of this force, which presses on the cell against its outward normal: 0 to 95.997 N, the most
+    /// that a cell's three contact sensors can report
     #[arg(long, value_name = "N", requires_all = ["cell", "joints"], conflicts_with_all = ["epoch", "skin"], allow_negative_numbers = true)]
     force: Option<f64>,
     /// Positions of the chain's joints in rad or m, separated by spaces
     #[arg(long, value_name = "POSITIONS", requires = "force", allow_hyphen_values = true)]
     joints: Option<String>,
-    /// Compute the torques of many rows from a file
+    /// Compute the torques for each row of a CSV file
     #[arg(long, value_name = "ROWS.csv", conflicts_with_all = ["force", "cell", "epoch", "skin"])]
     batch: Option<PathBuf>,
 }
@@ -146,8 +146,8 @@ impl<'a> Calculator<'a> {
         let joints: Vec<_> = skin.joints_on_bus(cell.bus).map(|(_, joint)| joint).collect();
         if !(0.0..=MAX_FORCE_N).contains(&force) {
             return Err(format!(
-                "force {force} N: the force against the outward normal must be 0 to {MAX_FORCE_N:.3} N, what a \
-                 cell's three contact sensors can report"
+                "force {force} N: the force against the outward normal must be 0 to {MAX_FORCE_N:.3} N, the \
+                 most that a cell's three contact sensors can report"
             ));
         }
         let given: Vec<&str> = positions.split([' ', ',']).filter(|text| !text.is_empty()).collect();

@@ -50,12 +50,12 @@ pub(super) fn table(skin: &Skin, rows: &[RatesRow]) -> String {
         ),
     };
     format!(
-        "{}: {bus}, a joints message every {} ms, each cell computes for {} µs\n{table}\n\
-         load    worst case: all cells answer; joints, {}, heartbeats{}\n\
-         last    longest time from the scheduled joints message to the end of the last answer\n\
-         cells   number of cells that a bus can serve in time; transceivers can drive about {}\n\
-         buses   number of buses that {cells} cells need, and the limit that determines it: time or nodes\n\
-         roots   result with sums if only the roots are on this bus; with all cells on it, sums save no frames\n",
+        "{}: {bus}, a joints message every {} ms, each cell computes for {} µs\n{table}\nload    worst case: \
+         all cells answer; joints, {}, heartbeats{}\nlast    longest time from the scheduled joints message \
+         to the end of the last answer\ncells   number of cells that a bus can serve in time; transceivers \
+         can drive about {}\nbuses   number of buses that {cells} cells need, and the limit that determines \
+         it: time or nodes\nroots   result if cells send sums and only the roots are on this bus; with all \
+         cells on it, sums save no frames\n",
         printable(&skin.name),
         format_millis(case.period_ns),
         format_micros(case.computation_ns),
@@ -77,7 +77,7 @@ pub(super) fn format_bus_fits(skin: &Skin, buses: &[BusFit], whole: Option<&Skin
     }
     // With one bus, its own section has the same values.
     if let Some(whole) = whole.filter(|_| buses.len() > 1) {
-        rows.add_section(format!("all {} cells", whole.cells), "", "on buses like the fullest one");
+        rows.add_section(format!("all {} cells", whole.cells), "", "if each bus is as full as the fullest");
         rows.add_row("buses needed", format_needed_buses(&whole.need), format_each_need(&whole.need));
         for SpreadFit { buses, fullest } in &whole.spread {
             let on = format!("{} of {} cells", count_with_noun(*buses, "bus"), fullest.case.answers.cells());
@@ -113,7 +113,7 @@ fn add_bus_section(rows: &mut KeyValueTable, bus: &BusFit) {
     let due = format!("due after {} ms", format_millis(case.deadline_ns()));
     rows.add_row("last answer", format_last_answer(rated), comma_separated([due].into_iter().chain(bounds)));
     let heartbeat =
-        or_else_text(times.heartbeat_ns.map(|ns| format!("{} ms", format_millis(ns))), "no bound");
+        or_else_text(times.heartbeat_ns.map(|ns| format!("{} ms", format_millis(ns))), "no upper bound");
     rows.add_row("heartbeats delayed by", heartbeat, "a cell silent for 600 ms counts as dead");
     let others = format!("bandwidth {}, deadline {}, nodes {}", most.bandwidth, most.deadline, most.nodes);
     rows.add_row("cells that fit", most.max_cells_in_time().min(most.nodes), others);
@@ -128,7 +128,7 @@ fn add_bus_section(rows: &mut KeyValueTable, bus: &BusFit) {
             );
         }
     }
-    rows.add_section("  other kinds of answers", "", "");
+    rows.add_section("  with other replies", "", "");
     for hint in answers {
         rows.add_row(
             format!("  {}", hint.change),
@@ -137,7 +137,7 @@ fn add_bus_section(rows: &mut KeyValueTable, bus: &BusFit) {
         );
     }
     if !answers.iter().any(|it| is_roots_only(&it.after.case)) {
-        rows.add_row("  sums", "not possible", "a cell is unreachable");
+        rows.add_row("  sums", "not possible", "a cell has no route to the gateway");
     }
 }
 
@@ -169,7 +169,7 @@ fn format_last_answer(rated: &AssessedBus) -> String {
     let AssessedBus { case, load, times, .. } = rated;
     match times.last_answer_ns() {
         Some(last_ns) => format!("{} ms", format_millis(last_ns)),
-        None if load.total() > 1.0 => "no bound".to_owned(),
+        None if load.total() > 1.0 => "no upper bound".to_owned(),
         None => format!("above {} ms", format_millis(case.period_ns)),
     }
 }

@@ -82,7 +82,10 @@ impl Args for OtherPageOptions {
                             .into_iter()
                             .chain(pages.map(|(_, field)| field.name_without_unit())),
                     )
-                    .help(format!("{}{rest}{unit}; sent instead of a touch", first.to_uppercase())),
+                    .help(format!(
+                        "{}{rest}{unit}; replaces the force and the proximity",
+                        first.to_uppercase()
+                    )),
             )
         })
     }

@@ -15,16 +15,16 @@ use super::sensing;
 
 #[derive(Debug, Subcommand)]
 pub(super) enum PacketCommand {
-    /// Make cells stop answering until a resume
+    /// Make cells stop sending torques until a resume
     #[command(after_help = "Example:\n  skinbus frame halt")]
     Halt,
     /// Make cells leave the halted state
     #[command(after_help = "Example:\n  skinbus frame resume")]
     Resume,
-    /// Make cells answer with a heartbeat when all work for the last joints message is done
+    /// Make each cell send a heartbeat as soon as it has finished with the last joints message
     #[command(after_help = "Example:\n  skinbus frame sync")]
     Sync,
-    /// Make cells answer with the pages of counters and sensors
+    /// Make cells send their counters and sensor values
     #[command(after_help = "Example:\n  skinbus frame report")]
     Report,
     Joints(JointsCommand),
@@ -33,13 +33,13 @@ pub(super) enum PacketCommand {
     Sensing(sensing::SensingCommand),
 }
 
-/// The joint positions of an epoch
+/// Make cells compute torques for these joint positions
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus frame joints --epoch 7 --rad 0 -1.2 1.0 -1.4 -1.57 0
   skinbus frame joints --epoch 7 --words 0 0xCF1C 0x28BE 0xC6F5 0xC008 0")]
 pub(super) struct JointsCommand {
-    /// Number of this broadcast, 0 to 255; cells ignore a repetition of the last number
+    /// Epoch of this broadcast, 0 to 255; cells ignore a message with the same epoch as the last one
     #[arg(long, value_name = "E")]
     epoch: u8,
     #[command(flatten)]
@@ -49,15 +49,15 @@ pub(super) struct JointsCommand {
 #[derive(Args, Debug)]
 #[group(required = true, multiple = false)]
 struct Angles {
-    /// One position for each of the chain's 1 to 14 joints, in rad; wrapped to one turn
+    /// Positions of the chain's joints (1 to 14) in rad; each is wrapped to one turn
     #[arg(long, value_name = "RAD", num_args = 1.., allow_negative_numbers = true)]
     rad: Option<Vec<String>>,
-    /// The positions as words: -32768 to 32767 or 0x0 to 0xFFFF, in steps of a turn / 65536
+    /// Positions of the joints as 16-bit words, -32768 to 32767 or 0x0 to 0xFFFF, in steps of 1/65536 turn
     #[arg(long, value_name = "WORD", num_args = 1.., allow_negative_numbers = true)]
     words: Option<Vec<String>>,
 }
 
-/// A stimulus: the contact state of a cell in test mode
+/// Set the sensor values that a cell in test mode uses: force, proximity and others
 ///
 /// The cell must be in test mode: `skinbus frame configure --cell N --write mode 1`. A stimulus takes effect with the
 /// next joints message and holds until another one replaces it. Without --force the force is 0.
@@ -67,21 +67,21 @@ struct Angles {
   skinbus frame stimulus --cell everyone --epoch 7 --force 0.5 --proximity 0.9
   skinbus frame stimulus --cell 12 --acceleration 0 0 1")]
 pub(super) struct StimulusCommand {
-    /// The cell, or everyone
+    /// Cell that receives the packet, or everyone
     #[arg(long, value_name = "[BUS:]NODE", value_parser = addressee)]
     cell: NodeSelector,
-    /// Force of the touch in N, divided among the three contact words
+    /// Force of the touch in N, divided among the cell's three contact sensors
     #[arg(long, value_name = "N", allow_negative_numbers = true)]
     force: Option<String>,
     /// Proximity from 0 (nothing near) to 1
     #[arg(long, value_name = "P", allow_negative_numbers = true)]
     proximity: Option<String>,
-    /// The two temperatures in degrees Celsius
+    /// Readings of the cell's two temperature sensors in degrees Celsius
     #[arg(long, num_args = 2, value_names = ["T1", "T2"], allow_negative_numbers = true)]
     temperature: Option<Vec<String>>,
     #[command(flatten)]
     others: OtherPageOptions,
-    /// Epoch of the joints message with which the stimulus takes effect [default: that of the next one]
+    /// Epoch of the joints message from which the stimulus takes effect [default: that of the next one]
     #[arg(long, value_name = "E")]
     epoch: Option<u8>,
 }
@@ -115,12 +115,12 @@ pub(super) struct StimulusCommand {
   skinbus frame configure --cell 12 --write 99 1 -1 0x7FFF"
 )]
 pub(super) struct ConfigureCommand {
-    /// The cell, or everyone
+    /// Cell that receives the packet, or everyone
     #[arg(long, value_name = "[BUS:]NODE", value_parser = addressee)]
     cell: NodeSelector,
     #[command(flatten)]
     request: ParameterRequest,
-    /// Tag, copied into the answer
+    /// Tag that the cell copies into its answer, 0 to 255
     #[arg(long, value_name = "T", default_value_t = 0)]
     tag: u8,
 }
@@ -237,7 +237,7 @@ fn parse_option_value<T>(
 /// Parses a value of a sensor field.
 fn parse_sensor_value<const F: u32>(option: &str, name: &str, text: &str) -> Result<Q<F>, String> {
     let field = stimulus_layouts().flat_map(|layout| &layout.fields).find(|field| field.name == name);
-    let field = field.ok_or_else(|| format!("{option}: cells do not measure {name}"))?;
+    let field = field.ok_or_else(|| format!("{option}: cells have no sensor for {name}"))?;
     let word = parse_option_value(option, text, |text| {
         parameter::parse_finite(text).and_then(|_| parameter::parse_value(field, text))
     })?;
@@ -265,7 +265,7 @@ fn parse_force_words(text: &str) -> Result<[Q5_10; 3], String> {
     if (sum - force).abs() > 1.0 / 1_024.0 {
         let [min, max] = [Q5_10::MIN, Q5_10::MAX].map(|word| 3.0 * word.to_f64());
         return Err(format!(
-            "--force {text}: use {min} to {max:.3} N, what a cell's three contact sensors can report"
+            "--force {text}: use {min} to {max:.3} N, the most that a cell's three contact sensors can report"
         ));
     }
     Ok(words)
@@ -301,7 +301,7 @@ mod tests {
         );
         assert_eq!(
             says("stimulus --cell 12 --force 96"),
-            "--force 96: use -96 to 95.997 N, what a cell's three contact sensors can report"
+            "--force 96: use -96 to 95.997 N, the most that a cell's three contact sensors can report"
         );
         assert_eq!(says("stimulus --cell 12 --force nan"), "--force nan: it must be a number");
         assert_eq!(says("stimulus --cell 12 --proximity -0.1"), "--proximity -0.1: proximity is 0 to 1");

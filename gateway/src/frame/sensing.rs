@@ -25,13 +25,13 @@ use model::decode::pick::NodeSelector;
   skinbus frame sensing continuous 62.5 --cell 12 --bus vcan0
   skinbus frame sensing off --skin skin.toml")]
 pub(super) struct SensingCommand {
-    /// Mode in which cells send their sensor values
+    /// When cells send their sensor values
     #[arg(value_parser = one_of_values(MODES))]
     mode: SensingMode,
-    /// Rate in continuous mode: frames per second of each cell
+    /// Rate in continuous mode, in frames per second and cell
     #[arg(value_name = "HZ", allow_negative_numbers = true)]
     hz: Option<f64>,
-    /// The cell, or everyone
+    /// Cell that receives the packet, or everyone
     #[arg(long, value_name = "[BUS:]NODE", value_parser = addressee, default_value = "everyone")]
     pub(super) cell: NodeSelector,
 }
@@ -45,9 +45,9 @@ enum SensingMode {
 }
 
 const MODES: &[OptionValue<SensingMode>] = &[
-    ("off", "Only on a report command", SensingMode::Off),
-    ("continuous", "At a fixed rate", SensingMode::Continuous),
-    ("event", "On changes, and with each heartbeat", SensingMode::Event),
+    ("off", "Send sensor values only when a report command asks for them", SensingMode::Off),
+    ("continuous", "Send sensor values at a fixed rate", SensingMode::Continuous),
+    ("event", "Send sensor values when they change, and with each heartbeat", SensingMode::Event),
 ];
 
 impl SensingCommand {

@@ -85,7 +85,7 @@ fn summary_rows(summary: &Summary, look: TableStyle) -> KeyValueTable {
     rows = rows.with_colours(look.is_coloured);
     add_halt_sections(&mut rows, summary);
     for error in &summary.cell_errors {
-        rows.add_section("cells ended by an error", count_with_noun(error.count(), "cell"), &error.reason);
+        rows.add_section("cells that failed", count_with_noun(error.count(), "cell"), &error.reason);
         rows.add_row("cells", error.names(), "");
     }
     add_accuracy_rows(&mut rows, summary, is_verbose);
@@ -134,7 +134,7 @@ fn add_accuracy_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bo
         if is_verbose {
             let errors = &accuracy.unquantised;
             rows.add_row(
-                "  against unrounded parameters",
+                "  with unrounded parameters",
                 format_mean_and_max(errors),
                 format_torque_count(errors),
             );
@@ -185,14 +185,14 @@ fn add_control_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: boo
     rows.add_row(
         "tick lateness",
         format_quantiles(&control.late_us),
-        format!("idle {}", format_quantiles(&control.idle_late_us)),
+        format!("idle machine: {}", format_quantiles(&control.idle_late_us)),
     );
     if is_verbose && control.central_us.count > 0 {
         rows.add_row("tick duration", format_quantiles(&control.took_us), "");
         rows.add_row(
             "  central computation in it",
             format_quantiles(&control.central_us),
-            "distributed computation: 0",
+            "none in distributed mode",
         );
     }
     if is_verbose && control.took_distributed_us.count > 0 {
@@ -207,7 +207,7 @@ fn add_control_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: boo
     }
     let why = "the bus refused them, or this machine was busy";
     rows.add_row_unless_zero("frames not sent", control.unsent, why);
-    rows.add_row_unless_zero("records of ticks lost", control.records_lost, why);
+    rows.add_row_unless_zero("tick records lost", control.records_lost, why);
     for (name, count) in &control.controller {
         rows.add_row("external controller", count, name);
     }
@@ -226,7 +226,7 @@ fn add_reply_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) 
     rows.add_section(&bus.name, counts_by_kind(&bus.cells), &bus.kind);
     if bus.outages.times > 0 {
         let end = if bus.outages.at_end { ", also at the end" } else { "" };
-        let ticks = format!("{} without the bus", count_with_noun(bus.outages.ticks, "tick"));
+        let ticks = format!("{} ran without this bus", count_with_noun(bus.outages.ticks, "tick"));
         let times = count_with_noun(bus.outages.times, "time");
         rows.add_row("bus lost", format!("{times}, {:.1} s{end}", bus.outages.lost_s), ticks);
     }
@@ -301,7 +301,7 @@ fn add_reply_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) 
         let name = format!("{last} after broadcast, µs");
         rows.add_row(name, format_quantiles(&bus.last_reply_us), "by kernel time stamps");
         if bus.sums.is_none() {
-            rows.add_row("  each reply, µs", format_quantiles(&bus.reply_us), "late ones included");
+            rows.add_row("  each reply, µs", format_quantiles(&bus.reply_us), "including late replies");
         }
         add_joint_age_row(rows, bus);
     } else if bus.last_reply_us.count > 0 {
@@ -315,16 +315,16 @@ fn add_sum_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     let Some(sums) = &bus.sums else { return };
     let counts = sums.counts;
     if is_verbose || counts.resent + counts.overheard + counts.stale > 0 {
-        let more =
-            format!("{} resent, {} overheard, {} stale", counts.resent, counts.overheard, counts.stale);
+        let more = format!(
+            "{} sent again, {} for other cells, {} too old",
+            counts.resent, counts.overheard, counts.stale
+        );
         rows.add_row(format!("sums from {}", count_with_noun(sums.roots, "root")), counts.first, more);
     }
     if is_verbose {
         let on_the_bus = counts.received + bus.uplink.unheard;
-        let taken = format!(
-            "the gateway received {}: the tree relieves the gateway, but not a shared bus",
-            counts.received
-        );
+        let taken =
+            format!("the gateway received {}; on a shared bus, all sums use bus time", counts.received);
         rows.add_row("sums on the bus, of all cells", on_the_bus, taken);
     }
     let Some(network) = &bus.network else { return };
@@ -367,8 +367,8 @@ fn add_due_rows(
     [contact_unknown, unexpected]: [u64; 2],
 ) {
     let reasons = [
-        (contact_unknown, "the contact of their cells is unknown"),
-        (unexpected, "nothing touched their cells"),
+        (contact_unknown, "it is unknown whether the cells were touched"),
+        (unexpected, "the cells were not touched"),
     ];
     let mut reasons = reasons.into_iter().filter(|(count, _)| *count > 0);
     let beside = if due == 0 { reasons.next() } else { None };
@@ -386,7 +386,7 @@ fn add_due_rows(
 /// Adds a row on the age of joints that cells have not received.
 fn add_joint_age_row(rows: &mut KeyValueTable, bus: &BusSummary) {
     let why = "a large age means a busy machine or lost frames";
-    rows.add_row("age of joints not received, µs", format_quantiles(&bus.joints_not_taken_us), why);
+    rows.add_row("age of missed joints, µs", format_quantiles(&bus.joints_not_taken_us), why);
 }
 
 /// Converts a key of the summary to words.
@@ -412,19 +412,15 @@ fn add_noteworthy_cell_rows(rows: &mut KeyValueTable, bus: &BusSummary, all: &[C
     let measuring: Vec<_> = all().filter(|cell| cell.is_measuring()).map(|cell| cell.node).collect();
     if !measuring.is_empty() {
         rows.add_row(
-            "cells that measure",
+            "cells in mode measure",
             space_separated(measuring),
-            "not pressed; their torques were not compared",
+            "own sensors, so torques were not compared",
         );
     }
     let unclear: Vec<_> =
         all().filter(|cell| cell.contact_unknown > 0 && !cell.is_measuring()).map(|cell| cell.node).collect();
     if !unclear.is_empty() {
-        rows.add_row(
-            "cells of unknown contact",
-            space_separated(unclear),
-            "because of earlier stimuli or a baseline",
-        );
+        rows.add_row("contact unknown", space_separated(unclear), "cells with earlier stimuli or a baseline");
     }
     for cell in all().filter(|cell| !cell.stuck.is_empty()) {
         let kinds = cell.stuck.iter().map(|(kind, count)| format!("{count} equal {kind} words"));
@@ -481,7 +477,7 @@ fn add_cost_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) 
         rows.add_section("recording", &file.path, format!("{frames}, {size}"));
     }
     if is_verbose || recording.lost > 0 || recording.files.is_empty() {
-        rows.add_row("frames in every format", recording.frames, format!("{} lost", recording.lost));
+        rows.add_row("frames recorded", recording.frames, format!("{} lost", recording.lost));
     }
 }
 

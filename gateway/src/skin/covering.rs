@@ -14,19 +14,20 @@ use super::super::visuals::{PackageOptions, Visuals};
 /// Options for the covered links.
 #[derive(Args, Debug)]
 pub(super) struct CoverArguments {
-    /// Cover these links with cells, on the meshes and shapes of their visuals; the other links are obstacles
+    /// Place cells on the surfaces of these links, taken from the visuals in the URDF; other links are obstacles
     #[arg(long, value_name = "LINK,..", value_delimiter = ',', value_parser = parse_link_name, conflicts_with = "places")]
     pub(super) cover: Vec<String>,
     /// Distance between the centers of neighbouring cells in m, 0.001 to 1
     #[arg(long, value_name = "M", requires = "cover", default_value_t = 0.028, value_parser = parse_pitch, allow_negative_numbers = true)]
     pitch: f64,
-    /// Treat these links as absent: their visuals are not read, and cells may be placed where they are
+    /// Ignore the visuals of these links, so that cells may be placed where these links are
     #[arg(long, value_name = "LINK,..", requires = "cover", value_delimiter = ',', value_parser = parse_link_name)]
     leave_out: Vec<String>,
-    /// A box to keep free of cells: its corners in m, in the frame of a covered link; may be given several times
+    /// Keep this box free of cells: its corners in m, in the frame of a covered link; repeat the option for further
+    /// boxes
     #[arg(long, value_name = "LINK:MINX,MINY,MINZ,MAXX,MAXY,MAXZ", requires = "cover", value_parser = keep_out)]
     keep_out: Vec<ExcludedBox>,
-    /// Random seed: the same seed gives the same cells
+    /// Random seed; the same seed places the cells in the same way
     #[arg(long, value_name = "N", requires = "cover", default_value_t = 1)]
     seed: u64,
     /// Maximum number of cells per bus
@@ -240,9 +241,10 @@ fn no_cells_reason(LinkFigures { name, outer_area, kept_out, .. }: &LinkFigures,
     let why = if is_flat {
         "its triangles have no area: correct its meshes, or take it out of --cover".to_owned()
     } else if *outer_area <= 0.0 {
-        "other links hide all of it: take it out of --cover, or add those to --leave-out".to_owned()
+        "other links enclose the whole link: take it out of --cover, or add the others to --leave-out"
+            .to_owned()
     } else if *kept_out >= 1.0 {
-        "the boxes of --keep-out leave nothing of it: make them smaller, or take the link out of --cover"
+        "the boxes of --keep-out contain the whole link: make them smaller, or take the link out of --cover"
             .to_owned()
     } else {
         format!("no cell fits on its {outer_area:.4} m2: lower the pitch, or take the link out of --cover")

@@ -24,16 +24,16 @@ use crate::print::comma_separated;
   skinbus skin dbc run.mcap -o run.dbc
   candump -L vcan0 | python3 -m cantools decode -s skin.dbc")]
 pub(super) struct DbcCommand {
-    /// A skin, or a recording of a run, which contains its skin
+    /// Skin file (TOML), or the recording of a run, which contains a skin
     #[arg(value_name = "SKIN|MCAP")]
     file: PathBuf,
-    /// The bus, if the skin has several
+    /// Name of the bus to describe, if the skin has several
     #[arg(long, value_name = "NAME")]
     bus: Option<String>,
-    /// For a classic bus: describe the joined bytes of a packet's frames, for a program that joins them first
+    /// With a classic bus: describe whole packets, for a program that first joins the frames of each packet
     #[arg(long)]
     joined: bool,
-    /// The file to write, completely or not at all [default: standard output]
+    /// Output file; after an error, no incomplete file is left [default: standard output]
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]
@@ -63,8 +63,9 @@ impl DbcCommand {
         match (description.format, self.joined) {
             (Format::Classic, false) => {
                 return Err(Failure::usage_error(format!(
-                    "bus {} is classic: a packet consists of several frames with one identifier, which a DBC cannot \
-                     tell apart; --joined describes the joined bytes of these frames, for a program that joins them first",
+                    "bus {} is classic: a packet consists of several frames with one identifier, which a DBC \
+                     cannot tell apart: add --joined to describe whole packets, for a program that joins \
+                     their frames first",
                     description.name
                 )));
             }

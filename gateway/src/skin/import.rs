@@ -48,7 +48,7 @@ pub(super) struct ImportCommand {
     places: Option<PathBuf>,
     #[command(flatten)]
     covering: CoverArguments,
-    /// The file to write, completely or not at all [default: standard output]
+    /// Output file; after an error, no incomplete file is left [default: standard output]
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]

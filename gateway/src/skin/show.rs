@@ -19,18 +19,18 @@ const MAX_TRIANGLES: usize = 12_000;
 
 /// Draw a skin in 3D, as one self-contained HTML page
 ///
-/// Each joint stands as near to 0 as its limits allow. If the skin has robot.urdf, the robot's links are drawn by their
-/// meshes, as far as these are found; otherwise tubes lead from frame to frame. FILE.html#vcan1:72 shows node 72 of
-/// vcan1.
+/// Joints are drawn at 0, or as near to 0 as their limits allow. If the skin has robot.urdf, the robot's links are
+/// drawn by their meshes, as far as these are found; otherwise as tubes between the frames of the joints.
+/// FILE.html#vcan1:72 shows node 72 of vcan1.
 #[derive(Args, Debug)]
 #[command(after_help = "Example:\n  skinbus skin show skin.toml -o skin.html")]
 pub(super) struct ShowCommand {
-    /// The skin
+    /// Skin file (TOML) to draw
     #[arg(value_name = "SKIN")]
     file: PathBuf,
     #[command(flatten)]
     packages: PackageOptions,
-    /// The file to write, completely or not at all [default: standard output]
+    /// Output file; after an error, no incomplete file is left [default: standard output]
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]

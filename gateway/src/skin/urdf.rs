@@ -18,10 +18,10 @@ use super::super::output::{OverwriteOption, check_distinct_files};
 #[derive(Args, Debug)]
 #[command(after_help = "Example:\n  skinbus skin urdf skin.toml -o robot.urdf")]
 pub(super) struct UrdfCommand {
-    /// The skin
+    /// Skin file (TOML) whose robot is described
     #[arg(value_name = "SKIN")]
     file: PathBuf,
-    /// The file to write, completely or not at all [default: standard output]
+    /// Output file; after an error, no incomplete file is left [default: standard output]
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]

@@ -31,7 +31,7 @@ impl AddressFile {
             |error: io::Error| Failure::usage_error(format!("--address-file {}: {error}", path.display()));
         let is_file = fs::symlink_metadata(path).is_ok_and(|about| about.is_file());
         if is_file && !is_address_file(path) {
-            let why = "it exists and does not contain the address of a page: name another file";
+            let why = "the file exists and does not contain the address of a page: name another file";
             return Err(refused(io::Error::new(io::ErrorKind::AlreadyExists, why)));
         }
         // Without this check, the error for a symlink would name an option that does not exist.

@@ -180,12 +180,12 @@ fn what_has_no_columns_is_refused_in_one_line_and_nothing_is_written() {
         (
             "fd.mcap here.columns",
             2,
-            "skinbus: here.columns: it exists: name another file, or overwrite it with --overwrite",
+            "skinbus: here.columns: the file exists: name another file, or add --overwrite",
         ),
         (
             "fd.mcap mine.columns --overwrite",
             2,
-            "skinbus: mine.columns: it is a folder of other files: name another one",
+            "skinbus: mine.columns: the folder contains other files: name another folder",
         ),
         (
             "fd.mcap none/out.columns",

@@ -127,11 +127,10 @@ fn lines_that_cannot_be_read_are_named_and_the_others_shown() {
     assert_eq!(decoded(text(&stdout)), ["ok      halt", "foreign remote frame"]);
     let name = file.display();
     let expected = format!(
-        "{name}:2: column 18: expected an identifier of 3 or 8 hexadecimal digits\n\
-         {name}:3: 12 frames are missing here: the recorder lost them\n\
-         {name}:4: column 18: expected an identifier of 3 or 8 hexadecimal digits\n\
-         {name}: 2 of 6 lines could not be read\n\
-         {name}: CAN XL frames are not shown: 1\n"
+        "{name}:2: column 18: expected an identifier of 3 or 8 hexadecimal digits\n{name}:3: 12 frames are \
+         missing here, because the recorder lost them\n{name}:4: column 18: expected an identifier of 3 or 8 \
+         hexadecimal digits\n{name}: 2 of 6 lines could not be read\n{name}: CAN XL frames are not shown: \
+         1\n"
     );
     assert_eq!(text(&stderr), expected);
 }
@@ -247,7 +246,7 @@ fn wrong_use_is_one_line_and_exit_code_2() {
         ),
         (
             "frame stimulus --cell 12 --force 100",
-            "--force 100: use -96 to 95.997 N, what a cell's three contact sensors can report",
+            "--force 100: use -96 to 95.997 N, the most that a cell's three contact sensors can report",
         ),
         (
             "frame stimulus",
@@ -346,7 +345,7 @@ fn a_check_shows_bit_rates_and_cells_at_one_place() {
     std::fs::write(&file, format!("{text}\n{another}")).unwrap();
     let shown = output(gateway(&format!("check {}", file.display())));
     assert!(shown.contains("bus vcan0 (fd, 500000 bit/s, torque): 2 cells"), "{shown}");
-    assert!(shown.contains("remark: cells 1 on vcan1 and 7 on vcan1 have the same position"), "{shown}");
+    assert!(shown.contains("note: cells 1 on vcan1 and 7 on vcan1 have the same position"), "{shown}");
 }
 
 /// Checks a scenario file beside a skin of three cells. Returns the output.

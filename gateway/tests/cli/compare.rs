@@ -137,7 +137,7 @@ fn a_word_that_is_one_step_off_is_found_with_its_epoch_cell_and_joint() {
     assert!((times[0] - times[1]).abs() < 1e-3, "{first}");
     let (epoch, cell) = (&first["epoch"], &first["cell"]);
     assert!(text.starts_with(&format!("different: torques; first at epoch {epoch} (")), "{text}");
-    assert!(text.contains("1 step apart"), "{text}");
+    assert!(text.contains("the difference is 1 step"), "{text}");
     // The commands that the output names work.
     let line = format!("skinbus explain off.log --epoch {epoch} --cell vcan0:{cell} --skin SKIN");
     assert!(text.contains(&line), "{text}");
@@ -189,7 +189,7 @@ fn standard_input_is_one_of_the_two() {
     let Output { status, stderr, .. } = child.stdin(Stdio::from(file)).output().unwrap();
     let said = String::from_utf8(stderr).unwrap();
     assert_eq!(status.code(), Some(2), "{said}");
-    assert!(said.contains("have different skins"), "{said}");
+    assert!(said.contains("were recorded with different skins"), "{said}");
 }
 
 #[test]
@@ -214,10 +214,14 @@ fn two_skins_and_what_is_no_capture_are_refused_in_one_line() {
     );
     fs::write(folder.join("moved.toml"), moved).unwrap();
     for (arguments, code, begin) in [
-        ("fd.mcap sums.mcap", 2, "fd.mcap and sums.mcap have different skins (cells: 3, in the other: 5)"),
-        ("fd.mcap fd.log --skin sums.toml", 2, "sums.toml and fd.mcap have different skins ("),
-        ("fd.log fd.log --skin moved.toml", 2, "fd.log does not match the skin "),
-        ("fd.log fd.log", 2, "neither fd.log nor fd.log contains a skin: name one with --skin"),
+        (
+            "fd.mcap sums.mcap",
+            2,
+            "fd.mcap and sums.mcap were recorded with different skins (cells: 3, in the other: 5)",
+        ),
+        ("fd.mcap fd.log --skin sums.toml", 2, "sums.toml and fd.mcap were recorded with different skins ("),
+        ("fd.log fd.log --skin moved.toml", 2, "fd.log was recorded with another skin than "),
+        ("fd.log fd.log", 2, "neither fd.log nor fd.log contains a skin: name the skin file with --skin"),
         ("fd.toml fd.log", 2, "fd.toml is a skin or a scenario, not a candump log or MCAP recording: "),
         (
             "fd.mcap other.log",
@@ -231,11 +235,11 @@ fn two_skins_and_what_is_no_capture_are_refused_in_one_line() {
         ("fd.mcap x.zip", 2, "x.zip is "),
         ("fd.mcap nowhere.mcap", 2, "nowhere.mcap: "),
         ("fd.mcap .", 2, ". is a directory: "),
-        ("- -", 2, "- and -: standard input can be read only once"),
+        ("- -", 2, "both inputs are - (standard input), which can be read only once"),
         (
             "fd.mcap fd.mcap --junit fd.mcap --overwrite",
             2,
-            "--junit fd.mcap is a file that this command reads",
+            "--junit fd.mcap is also an input of this command",
         ),
     ] {
         let said = refusal(folder, &format!("compare {arguments}"), code);
@@ -286,7 +290,7 @@ fn a_report_for_servers_has_a_case_for_each_aspect_and_replaces_no_file_unasked(
     assert!(xml.contains("name=\"torques\"><failure message=\""), "{xml}");
     assert!(xml.contains("first difference: torque of cell "), "{xml}");
     let said = refusal(folder, "compare fd.mcap fd.log --junit out.xml", 2);
-    assert!(said.starts_with("--junit out.xml: it exists"), "{said}");
+    assert!(said.starts_with("--junit out.xml: the file exists"), "{said}");
     assert_eq!(gateway(folder, "compare fd.mcap fd.log --junit out.xml --overwrite").0, Some(0));
     let xml = fs::read_to_string(folder.join("out.xml")).unwrap();
     assert!(xml.contains("failures=\"0\""), "{xml}");

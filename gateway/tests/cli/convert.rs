@@ -78,7 +78,7 @@ fn a_log_becomes_a_recording_and_a_log_again() {
     assert_eq!(folder.text("back.log"), LOG);
     assert_eq!(folder.all().len(), 3, "and nothing beside them");
     let nine = folder.says("convert run.mcap nine.txt --digits 9 --plain", 0);
-    assert_eq!(nine, "run.mcap: 1 note is left out\nrun.mcap -> nine.txt: 2 frames, 0 notes\n");
+    assert_eq!(nine, "run.mcap: 1 note was left out\nrun.mcap -> nine.txt: 2 frames, 0 notes\n");
     assert_eq!(folder.text("nine.txt"), "(1.000001000) can0 123#11\n(2.000000000) can0 22C##5AABB\n");
 }
 
@@ -93,9 +93,9 @@ $ candump -td -a can0 vcan1
  (000.000001)  vcan1  123  [02]  DE AF
 ";
     let folder = Folder::new(&[("forum.txt", console.as_bytes())]);
-    let differences = "its times are differences (candump -t d): they are added up from 0";
-    let flags = "its lines do not say whether FD frames switch the bit rate (candump without -x): they are read as \
-                 if none did";
+    let differences = "its times are differences between frames (candump -t d): they are added up, from 0";
+    let flags = "its lines lack the FD flags (candump without -x): FD frames are read as frames without \
+                 bit-rate switch";
     for to in ["forum.log", "forum.mcap"] {
         let said = folder.says(&format!("convert forum.txt {to}"), 0);
         let expected =
@@ -156,8 +156,8 @@ fn what_is_no_capture_is_refused_by_its_name() {
     assert_eq!(folder.refuses("convert empty.log run.mcap", 1), "skinbus: empty.log: the file is empty");
     assert_eq!(
         folder.refuses("convert words.txt run.mcap", 1),
-        "skinbus: words.txt: no frame in 3 lines; expected the output of candump, with \
-         lines like `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`"
+        "skinbus: words.txt: no frame in 3 lines; expected the output of candump, with lines like \
+         `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`"
     );
     assert!(folder.refuses("convert run.pcapng run.mcap", 2).contains("is a packet capture"));
     for (name, begins, what) in [
@@ -180,7 +180,10 @@ fn what_is_no_capture_is_refused_by_its_name() {
             "{said}"
         );
     }
-    assert_eq!(folder.refuses("convert empty.mcap run.log", 1), "skinbus: empty.mcap: it contains no frame");
+    assert_eq!(
+        folder.refuses("convert empty.mcap run.log", 1),
+        "skinbus: empty.mcap: it contains no CAN frames"
+    );
     let gone = folder.refuses("convert gone.log run.mcap", 2);
     assert_eq!(gone, "skinbus: gone.log: No such file or directory (os error 2)");
     assert_eq!(folder.refuses("convert . run.mcap", 2), "skinbus: .: it is a folder, but a file is needed");
@@ -195,13 +198,13 @@ fn a_bad_line_is_named_and_kept_and_with_strict_it_is_the_end() {
     let folder = Folder::new(&[("run.log", log.as_bytes())]);
     assert_eq!(
         folder.refuses("convert run.log run.mcap --strict", 1),
-        "skinbus: run.log:2: column 4: expected digits of a second; without --strict, the line would be kept as it is"
+        "skinbus: run.log:2: column 4: expected digits of a second; leave out --strict to keep such lines \
+         unchanged"
     );
     assert_eq!(
         folder.says("convert run.log run.mcap", 0),
-        "run.log:2: column 4: expected digits of a second\n\
-         run.log: 1 line begins like a frame but is not one: not read\n\
-         run.log -> run.mcap: 2 frames, 1 notes\n"
+        "run.log:2: column 4: expected digits of a second\nrun.log: 1 line looks like a frame but is \
+         malformed: not read\nrun.log -> run.mcap: 2 frames, 1 notes\n"
     );
     folder.says("convert run.mcap back.log", 0);
     assert_eq!(folder.text("back.log"), log);
@@ -214,7 +217,7 @@ fn of_many_bad_lines_some_are_named_and_all_are_counted() {
     let said = folder.says("convert run.log run.mcap", 0);
     assert_eq!(said.lines().count(), 103, "{said}");
     assert!(said.contains("run.log:100: column 3:") && !said.contains("run.log:101:"), "{said}");
-    assert!(said.contains("run.log: 1000 lines begin like frames but are not"), "{said}");
+    assert!(said.contains("run.log: 1000 lines look like frames but are malformed"), "{said}");
 }
 
 #[test]
@@ -224,7 +227,8 @@ fn times_that_run_backwards_are_said_once() {
     let said = folder.says("convert run.log run.mcap", 0);
     assert!(
         said.starts_with(
-            "run.log: the time runs backwards 2 times, first at frame 2; the order of the frames is kept\n"
+            "run.log: the time stamps go backwards 2 times, first at frame 2; the order of the frames is \
+             kept\n"
         ),
         "{said}"
     );
@@ -236,7 +240,7 @@ fn an_output_that_exists_is_left_alone_unless_it_is_to_be_overwritten() {
     let folder = Folder::new(&[("run.log", LOG.as_bytes()), ("run.mcap", b"precious")]);
     assert_eq!(
         folder.refuses("convert run.log run.mcap", 2),
-        "skinbus: run.mcap: it exists: name another file, or overwrite it with --overwrite"
+        "skinbus: run.mcap: the file exists: name another file, or add --overwrite"
     );
     assert_eq!(
         folder.refuses("convert run.log . --overwrite", 2),
@@ -255,7 +259,7 @@ fn what_makes_no_sense_is_refused() {
     assert!(usage("convert run.log run.asc").starts_with("skinbus: run.asc: unknown file type: use .mcap"));
     assert_eq!(
         usage("convert run.log run.mcap --plain"),
-        "skinbus: --plain is only for a candump log: leave it out, because a recording keeps everything"
+        "skinbus: --plain is only for a candump log: leave it out, because an MCAP recording keeps everything"
     );
     assert!(
         usage("convert run.log run.mcap --digits 9")
@@ -300,7 +304,7 @@ fn of_a_recording_without_its_end_all_that_is_there_is_converted_and_that_is_sai
     );
     let strict = folder.refuses("convert cut.mcap strict.log --strict", 1);
     let expected = expected.trim_end();
-    assert_eq!(strict, format!("skinbus: {expected}; without --strict the intact part would be written"));
+    assert_eq!(strict, format!("skinbus: {expected}; leave out --strict to write the intact part"));
 }
 
 #[test]

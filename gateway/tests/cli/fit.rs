@@ -110,8 +110,10 @@ fn what_can_does_not_allow_is_refused_in_one_line() {
     assert!(refusal("fit nothing.toml").contains("nothing.toml"));
     for option in ["--rates vcan0=1M/5M", "--skin x.toml", "--bench-traffic", "--ber 0.001", "--duration 3"] {
         let (name, file) = (option.split(' ').next().unwrap(), skin);
-        let expected =
-            format!("skinbus: {name} is only for traffic, but {file} is a skin: leave the option out");
+        let expected = format!(
+            "skinbus: {name} is only for frames of a log, recording or bus, but {file} is a skin: \
+                     leave the option out"
+        );
         assert_eq!(refusal(&format!("fit {skin} {option}")), expected);
     }
 }
@@ -170,7 +172,8 @@ fn standard_input_is_read_for_one_thing() {
     {
         let Output { status, stderr, .. } = piped(&skin, command);
         let said = String::from_utf8(stderr).unwrap();
-        let expected = "it can be read only once, but two arguments name it: use a file for one of them\n";
+        let expected =
+            "two arguments name this input, but it can be read only once: use a file for one of them\n";
         assert_eq!((status.code(), said.contains(expected)), (Some(2), true), "{command}: {said}");
     }
     let Output { status, stderr, .. } = piped(&skin, "fit -");

@@ -140,7 +140,7 @@ fn four_commands_give_the_same_figures_for_one_skin_in_the_same_words() {
     let run = row(&shadow, "this run");
     let (load, verdict) = run[0].split_once(": ").unwrap();
     assert_eq!((verdict, run[1]), ("in time, but 254 nodes", "at most 120 of 253 cells answered"));
-    assert_eq!(row(&shadow, "most in any second")[0], load);
+    assert_eq!(row(&shadow, "highest in any second")[0], load);
     let of_log = files.gateway("fit run.log --skin skin.toml");
     assert_eq!((row(&of_log, "worst case"), row(&of_log, "this run")), (worst, run));
     let unknown = files.gateway("fit run.log --nominal 1M --data 5M");
@@ -156,7 +156,7 @@ fn four_commands_give_the_same_figures_for_one_skin_in_the_same_words() {
         ),
         format!("{at}, this run: {verdict} ({}) {load} {limits} (skin: bitrate) ✗", run[1]),
         format!("worst case does not fit: bandwidth 118.9 % {}", worst[1]),
-        format!("{load} {} {}, 120 on average", row(&shadow, "most in any 16 ms")[0], run[1]),
+        format!("{load} {} {}, 120 on average", row(&shadow, "highest in any 16 ms")[0], run[1]),
     ] {
         assert!(report.contains(&words), "{words}: {report}");
     }
@@ -191,13 +191,13 @@ fn four_commands_give_the_same_figures_for_one_skin_in_the_same_words() {
 fn stimuli_and_start_up_are_no_load_of_operation() {
     let files = Files::new("");
     let shadow = files.gateway("fit run.mcap");
-    assert_eq!(row(&shadow, "left out: bench traffic"), ["15000 frames", "15000 stimuli"]);
+    assert_eq!(row(&shadow, "bench frames, left out"), ["15000 frames", "15000 stimuli"]);
     let percent = |text: &str| text.split(' ').next().unwrap().parse::<f64>().unwrap();
     let average = percent(row(&shadow, "average load")[0]);
     // 121 packets of 60 to 70 us in 16 ms, and 253 heartbeats at once before them.
     assert!((45.0..54.0).contains(&average), "{shadow}");
     let start_up = shadow.split_once("start-up").unwrap().1;
-    assert!(percent(row(start_up, "most in any 16 ms")[0]) > 95.0, "{start_up}");
+    assert!(percent(row(start_up, "highest in any 16 ms")[0]) > 95.0, "{start_up}");
     assert!(row(&shadow, "busy at least 16 ms")[0].starts_with("0 times"), "{shadow}");
     // Without bench-only frames, the log is the same.
     let log = fs::read_to_string(files.path("run.log")).unwrap();
@@ -205,11 +205,11 @@ fn stimuli_and_start_up_are_no_load_of_operation() {
     assert!(without.len() < log.len() * 3 / 5);
     fs::write(files.path("less.log"), without).unwrap();
     let [log, less] = ["run.log", "less.log"].map(|name| files.gateway(&format!("fit {name}")));
-    for name in ["average load", "most in any second", "busy at least 16 ms", "all frames", "torque"] {
+    for name in ["average load", "highest in any second", "busy at least 16 ms", "all frames", "torque"] {
         assert_eq!(row(&log, name), row(&less, name), "{name}");
     }
     let all = files.gateway("fit run.mcap --bench-traffic");
-    assert_eq!(row(&all, "counted: bench traffic")[0], "15000 frames");
+    assert_eq!(row(&all, "bench frames, counted")[0], "15000 frames");
     assert!(percent(row(&all, "average load")[0]) > average + 40.0, "{all}");
 }
 

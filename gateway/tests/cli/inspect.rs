@@ -50,7 +50,7 @@ fn a_dbc_goes_to_standard_output_or_into_a_file_that_is_not_there_yet() {
     let written = || std::fs::read_to_string(folder.join("one.dbc")).unwrap();
     assert_eq!(written(), text);
     let said = refusal(folder, "skin dbc classic.toml --joined -o one.dbc", 2);
-    assert_eq!(said, "skinbus: -o one.dbc: it exists: name another file, or overwrite it with --overwrite");
+    assert_eq!(said, "skinbus: -o one.dbc: the file exists: name another file, or add --overwrite");
     assert_eq!(written(), text);
     output(folder, "skin dbc classic.toml --joined -o one.dbc --overwrite");
     assert!(written().contains("Classic: a packet travels in frames of up to 8 bytes under one identifier"));
@@ -89,9 +89,9 @@ fn a_classic_bus_is_described_only_as_joined_packets() {
     let folder = skins();
     let folder = folder.path();
     let said = refusal(folder, "skin dbc classic.toml", 2);
-    let expected = "skinbus: bus vcan0 is classic: a packet consists of several frames with one identifier, which a \
-                    DBC cannot tell apart; --joined describes the joined bytes of these frames, for a program that joins them \
-                    first";
+    let expected = "skinbus: bus vcan0 is classic: a packet consists of several frames with one identifier, \
+                    which a DBC cannot tell apart: add --joined to describe whole packets, for a program \
+                    that joins their frames first";
     assert_eq!(said, expected);
     let said = refusal(folder, "skin dbc one.toml --joined", 2);
     assert_eq!(said, "skinbus: --joined is for classic buses; on vcan0 a packet is one FD frame");
@@ -114,7 +114,7 @@ fn a_capture_in_numbers_is_a_table_or_an_object() {
                (1.000000) can1 12345678#\n";
     std::fs::write(folder.join("small.log"), log).unwrap();
     let Output { status, stdout, stderr } = gateway(folder, "dump small.log --stats --json");
-    let complaint = "small.log:4: 12 frames are missing here: the recorder lost them\n";
+    let complaint = "small.log:4: 12 frames are missing here, because the recorder lost them\n";
     assert_eq!((status.code(), std::str::from_utf8(&stderr)), (Some(0), Ok(complaint)));
     let numbers: serde_json::Value = serde_json::from_slice(&stdout).unwrap();
     assert_eq!((&numbers["format"], &numbers["frames"]), (&"candump log".into(), &5.into()));
@@ -267,7 +267,7 @@ fn the_worked_example_of_the_document_is_explained_in_a_terminal() {
     let words: Vec<_> = text.lines().filter(|line| line.contains("-1075") || line.contains("3195")).collect();
     assert_eq!(words.len(), 2, "{text}");
     let all = output(folder, "explain run.log --skin skin.toml --epoch 7");
-    assert!(all.contains("the whole skin: sums of the words in the frames"), "{all}");
+    assert!(all.contains("torques of the whole skin: sum of the words in the frames"), "{all}");
     let joint = output(folder, "explain run.log --skin skin.toml --epoch 7 --joint 2");
     assert!(joint.contains("3195") && !joint.contains("-1075"), "{joint}");
 }
@@ -359,10 +359,11 @@ fn a_hint_does_not_lead_to_the_next_refusal() {
     let folder = folder.path();
     std::fs::write(folder.join("words.txt"), "nothing\n").unwrap();
     // No skin, sensing mode or option would help here.
-    let description = "skinbus: skin.toml is a skin or a scenario, not a candump log or MCAP recording: it contains \
-                       no frames: name a capture";
+    let description = "skinbus: skin.toml is a skin or a scenario, not a candump log or MCAP recording: it \
+                       contains no CAN frames: name a candump log or an MCAP recording";
     let nothing = "skinbus: words.txt: no frame in 1 line; ";
-    let read = "skinbus: --node-ids skin.toml is a file that this command reads: name another file";
+    let read =
+        "skinbus: --node-ids skin.toml is also an input of this command: name another file for the output";
     for (arguments, code, begin) in [
         ("calibrate skin.toml --recording skin.toml", 2, description),
         ("calibrate skin.toml --recording words.txt", 1, nothing),

@@ -437,17 +437,16 @@ fn the_command_says_what_it_did_and_overwrites_nothing() {
     fs::write(path("gap.mcap"), &gap).unwrap();
     let said = says("recover gap.mcap", 1);
     assert!(
-        said.contains(
-            "only a part of gap.mcap could be recovered, and most of it is lost: gap-recovered.mcap, "
-        ) && said.contains(" 20 of 100 messages"),
+        said.contains("most of gap.mcap is lost, only a part could be recovered: gap-recovered.mcap, ")
+            && said.contains(" 20 of 100 messages"),
         "{said}"
     );
-    let exists = "skinbus: -o there.mcap: it exists: name another file, or overwrite it with --overwrite";
+    let exists = "skinbus: -o there.mcap: the file exists: name another file, or add --overwrite";
     assert_eq!(says("recover run.mcap.part -o there.mcap", 2), exists);
     assert_eq!(fs::read_to_string(path("there.mcap")).unwrap(), "somebody's");
     says("recover run.mcap.part -o there.mcap --overwrite", 0);
     assert_eq!(messages(&fs::read(path("there.mcap")).unwrap()).len(), 40);
-    let itself = "skinbus: -o whole.mcap is a file that this command reads: name another file";
+    let itself = "skinbus: -o whole.mcap is also an input of this command: name another file for the output";
     assert_eq!(says("recover whole.mcap -o whole.mcap --overwrite", 2), itself);
     assert!(
         says("recover a.zip", 1)

@@ -50,12 +50,12 @@ fn what_is_no_recording_of_a_run_is_refused_in_one_line_and_nothing_is_written()
     assert_eq!(refuses(&folder, "empty.mcap", 2), format!("empty.mcap contains no run: it is empty; {made}"));
     assert_eq!(
         refuses(&folder, "foreign.mcap", 2),
-        format!("foreign.mcap contains no run: skin.toml is not attached to it; {made}")
+        format!("foreign.mcap contains no run: it has no attachment skin.toml; {made}")
     );
     let begun = refuses(&folder, "begun.mcap", 1);
     assert!(
         begun.starts_with(
-            "begun.mcap contains no run that can be shown: skin.toml is not attached to it (its end is missing"
+            "begun.mcap contains no run that can be shown: it has no attachment skin.toml (its end is missing"
         ),
         "{begun}"
     );
@@ -81,10 +81,10 @@ fn what_would_be_overwritten_or_is_no_bit_rate_is_refused_before_anything_is_rea
     let recording = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/recordings/fd.mcap");
     fs::copy(recording, folder.path().join("run.mcap")).unwrap();
     fs::write(folder.path().join("run.html"), "mine").unwrap();
-    let exists = "-o run.html: it exists: name another file, or overwrite it with --overwrite";
+    let exists = "-o run.html: the file exists: name another file, or add --overwrite";
     assert_eq!(refuses(&folder, "run.mcap", 2), exists);
     let itself = refuses(&folder, "run.mcap -o run.mcap --overwrite", 2);
-    assert_eq!(itself, "-o run.mcap is a file that this command reads: name another file");
+    assert_eq!(itself, "-o run.mcap is also an input of this command: name another file for the output");
     let rate = refuses(&folder, "run.mcap -o new.html --nominal fast", 2);
     assert!(rate.contains("--nominal") && rate.contains("not a bit rate"), "{rate}");
     assert_eq!(fs::read_to_string(folder.path().join("run.html")).unwrap(), "mine");
@@ -238,8 +238,8 @@ fn a_log_of_something_else_and_another_skin_than_the_recorded_one_are_refused() 
         ("nowhere.log", "nowhere.log: "),
         (
             "fd.mcap",
-            "fd.mcap was recorded with a skin that differs from sums.toml (cells: 5, recorded: 3); leave --skin out: \
-             the recording contains its skin",
+            "fd.mcap was recorded with a skin that differs from sums.toml (cells: 5, recorded: 3): leave out \
+             --skin, because the recording contains its skin",
         ),
     ] {
         let refused = refuses(&folder, &format!("{arguments} --skin sums.toml -o out.html"), 2);

@@ -112,7 +112,12 @@ fn what_has_no_frame_and_what_is_no_capture_is_said_in_one_line() {
         ("fit x.zip", 2, "skinbus: x.zip is "),
         ("fit .", 2, "skinbus: . is a directory"),
         ("fit nowhere", 2, "skinbus: there is no file nowhere, and opening it as a bus failed: "),
-        ("fit run.log notes.txt", 2, "skinbus: notes.txt contains no frames: name only captures"),
+        (
+            "fit run.log notes.txt",
+            2,
+            "skinbus: notes.txt contains no CAN frames: leave it out, or name a \
+                                      candump log or an MCAP recording instead",
+        ),
         (
             "fit run.log vcan0",
             2,
@@ -122,7 +127,7 @@ fn what_has_no_frame_and_what_is_no_capture_is_said_in_one_line() {
         ("fit run.log --nominal 2M", 2, "skinbus: nominal bit rate 2000000 bit/s: CAN allows"),
         ("fit run.log --data 9M", 2, "skinbus: data bit rate 9000000 bit/s: CAN FD allows"),
         ("fit run.log --rates can0=1M/9M", 2, "skinbus: invalid value 'can0=1M/9M'"),
-        ("fit run.log --ber 2", 2, "skinbus: --ber: bit error rate 2: use 0 to 0.01"),
+        ("fit run.log --ber 2", 2, "skinbus: --ber: the bit error rate 2 is out of range: use 0 to 0.01"),
     ] {
         let (got, text, said) = gateway(folder.path(), arguments);
         assert_eq!(
@@ -141,7 +146,8 @@ fn a_time_at_the_end_of_all_clocks_is_a_time_like_others() {
     fs::write(folder.path().join("late.log"), log.repeat(3)).unwrap();
     for line in ["fit late.log", "fit late.log --json", "fit late.log --ber 0.01"] {
         let (code, out, said) = gateway(folder.path(), line);
-        let one = "late.log: all 3 frames of vcan0 have the time 18446744073.709551000: rates, gaps and loads mean nothing\n";
+        let one = "late.log: all 3 frames of vcan0 have the same time, 18446744073.709551000: rates, gaps \
+                   and bus loads are meaningless\n";
         assert_eq!((code, said.as_str()), (Some(0), one), "{line}");
         assert!(!out.is_empty());
     }

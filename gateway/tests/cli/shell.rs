@@ -55,7 +55,7 @@ fn every_command_has_a_man_page_without_former_names() {
     }
     let again = skinbus(folder.path(), "man .");
     assert_eq!(again.status.code(), Some(2));
-    assert!(text(&again.stderr).contains("it exists: name another file, or overwrite it with --overwrite"));
+    assert!(text(&again.stderr).contains("the file exists: name another file, or add --overwrite"));
 }
 
 #[test]

@@ -124,7 +124,7 @@ fn torques_that_come_in_sums_are_empty_and_the_central_ones_are_there() {
     let said = String::from_utf8(stderr).unwrap();
     assert_eq!(status.code(), Some(0), "{said}");
     assert!(
-        said.contains("the cells on vcan0 answer with sums: distributed torques and errors are empty"),
+        said.contains("the cells on vcan0 answer with sums, so distributed torques and errors are empty"),
         "{said}"
     );
     let rows = rows(&folder, "sums.csv");
@@ -187,11 +187,7 @@ fn what_has_no_torques_is_refused_in_one_line_and_nothing_is_written() {
             2,
             "skinbus: --skin fd.toml is only for CSV and columns: name an OUT that ends in .csv or .columns",
         ),
-        (
-            "fd.mcap mine.csv",
-            2,
-            "skinbus: mine.csv: it exists: name another file, or overwrite it with --overwrite",
-        ),
+        ("fd.mcap mine.csv", 2, "skinbus: mine.csv: the file exists: name another file, or add --overwrite"),
         (
             "fd.mcap fd.csv/out.csv",
             2,

@@ -112,8 +112,8 @@ fn wrong_use_is_said_in_one_line() {
         ("doctor rates.toml", "rates.toml:36:11: bus[0].bitrate = 5: must be 10000 to 1000000 bit/s"),
         (
             "doctor --bus-kind vcan",
-            "invalid value 'vcan' for '--bus-kind <KIND>': \"vcan\" is not a kind of bus: use auto, socketcan or \
-             embedded; try '--help'",
+            "invalid value 'vcan' for '--bus-kind <KIND>': \"vcan\" is not a bus kind: use auto, socketcan \
+             or embedded; try '--help'",
         ),
         (
             "up vcan0 --peer vcan1 --namespace nosuch",
@@ -261,7 +261,7 @@ fn the_doctor_wants_the_cells_program_and_a_private_directory() {
     std::fs::create_dir(folder.buses()).unwrap();
     std::fs::set_permissions(folder.buses(), std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
     let said = doctor();
-    assert!(findings(&said, "fault")[0].contains("has mode 0755, but the bus must be private"), "{said:?}");
+    assert!(findings(&said, "fault")[0].contains("has mode 0755, so other users can open it"), "{said:?}");
     assert_eq!(folder.run("doctor skin.toml --bus-kind embedded").code, 1);
 }
 

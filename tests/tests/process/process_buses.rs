@@ -81,7 +81,7 @@ fn ended_well(place: &TestDir, bench: Running, server: Option<Running>, times: u
         assert_eq!((silent.len(), summary.number(&format!("/buses/{index}/uplink/restarts"))), (0, 0));
         assert_eq!(summary.0["buses"][index]["name"], *bus);
     }
-    assert!(ended.stdout.contains("ticks without the bus"), "{}", ended.stdout);
+    assert!(ended.stdout.contains("ticks ran without this bus"), "{}", ended.stdout);
 }
 
 #[test]
@@ -219,7 +219,7 @@ fn a_bus_that_is_lost_at_the_end_makes_the_run_fail_with_its_figures() {
     let ended = bench.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     assert!(
-        ended.stderr.ends_with("skinbus: these buses were still lost when the run ended: vcan1\n"),
+        ended.stderr.ends_with("skinbus: these buses did not work when the run ended: vcan1\n"),
         "{ended:#?}"
     );
     let summary = place.summary();
@@ -294,7 +294,7 @@ fn each_bus_has_the_requested_kind() {
         "skinbus: --bus-kind is given twice for vcan1: embedded and socketcan; leave out one"
     );
     let said = refused("--bus-kind vcan1=vcan");
-    assert!(said.contains("\"vcan1=vcan\" is not a kind of bus: use auto, socketcan or embedded"), "{said}");
+    assert!(said.contains("\"vcan1=vcan\" is not a bus kind: use auto, socketcan or embedded"), "{said}");
     // Whatever the kernel has, it has no vcan1 of ours.
     let said = refused("--bus-kind embedded --bus-kind vcan1=socketcan");
     assert!(

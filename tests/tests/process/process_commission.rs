@@ -399,9 +399,9 @@ fn what_cannot_be_done_is_one_line() {
         assert!(line.starts_with("skinbus: no embedded bus vcan0 is served in "), "{line}");
     }
     let line = said("commission skin.toml --bus vcan7", 2);
-    assert_eq!(line, "skinbus: bus vcan7 is not in skin.toml, which has vcan0");
+    assert_eq!(line, "skinbus: the skin file skin.toml has no bus vcan7; its buses are vcan0");
     let line = said("cells vcan7 --skin skin.toml", 2);
-    assert_eq!(line, "skinbus: bus vcan7 is not in skin.toml, which has vcan0");
+    assert_eq!(line, "skinbus: the skin file skin.toml has no bus vcan7; its buses are vcan0");
     assert_eq!(
         said("commission nowhere.toml", 2),
         "skinbus: nowhere.toml: No such file or directory (os error 2)"

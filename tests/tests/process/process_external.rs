@@ -186,7 +186,7 @@ fn a_program_that_says_hello_in_another_version_is_no_controller() {
         let hello = [b"SKBC".as_slice(), &[2, 0, 3, 0]].concat();
         own.send_to(&hello, place.path("controller.sock")).unwrap();
     };
-    ends_without_controller(control, "(1 datagram without a hello of this version)");
+    ends_without_controller(control, "(1 datagram received, but none is a hello of this version)");
 }
 
 #[test]

@@ -194,7 +194,7 @@ fn cells_that_end_by_an_error_of_their_own_are_the_runs_outcome_and_their_reason
             let line = format!("skinbus: 4 cells ended with errors: 1-4 on vcan1 ({why})");
             assert_eq!(last, line);
         } else {
-            assert_eq!(last, "skinbus: 4 cells ended with errors, given above: 1-4 on vcan1");
+            assert_eq!(last, "skinbus: 4 cells ended with errors (see above): 1-4 on vcan1");
             let note = format!("the process of cells 1 to 4 on vcan1 ended (exit status: 1: {why})\n");
             assert!(ended.stderr.contains(&note), "{ended:#?}");
         }

@@ -105,7 +105,7 @@ fn a_log_can_be_followed_while_it_grows_and_has_one_writer() {
         let options = ["", "--overwrite"];
         for option in options {
             let words = format!("run skin.toml --bus-kind embedded --candump {name} {option}");
-            let why = "another run is writing it: name another file, or wait for that run's end";
+            let why = "another run is writing this file: name another file, or wait until that run has ended";
             let said = place.start("skinbus", &words).end();
             assert_eq!(said.refusal(2), format!("skinbus: --candump {name}: {why}"));
         }
@@ -146,9 +146,9 @@ fn no_option_of_any_command_overwrites_a_file_or_follows_a_symlink_to_one() {
     for (option, words, name) in WRITERS {
         let path = place.path(name);
         for (make, why) in [
-            ("file", "exists: name another file, or overwrite it with --overwrite"),
-            ("link", "name another one"),
-            ("dangling", "name another one"),
+            ("file", "exists: name another file, or add --overwrite"),
+            ("link", "name another file"),
+            ("dangling", "name another file"),
             ("directory", "name a file in a folder that can be written"),
         ] {
             match make {
@@ -168,7 +168,7 @@ fn no_option_of_any_command_overwrites_a_file_or_follows_a_symlink_to_one() {
                 assert_eq!(ended.code(), Some(2), "{make}, {words}: {ended:#?}");
                 let said = ended.stderr.lines().last().unwrap();
                 assert!(said.starts_with(&format!("skinbus: {option}{name}: ")), "{words}: {said}");
-                let elsewhere = why.replace("name another one", "or another one");
+                let elsewhere = why.replace("name another file", "or another file");
                 assert!(said.ends_with(why) || said.ends_with(&elsewhere), "{make}, {words}: {said}");
                 assert!(place.files() == before && !place.path("nowhere").exists(), "{words}");
                 assert_eq!(place.read("mine"), "mine\n", "{words}");
@@ -243,7 +243,7 @@ fn no_command_overwrites_what_it_reads_even_with_force() {
         ("-o ", "skin dbc skin.toml -o".to_owned(), "skin.toml"),
     ] {
         let ended = place.start("skinbus", &format!("{words} {name} --overwrite")).end();
-        let why = "is a file that this command reads: name another file";
+        let why = "is also an input of this command: name another file for the output";
         assert_eq!(ended.refusal(2), format!("skinbus: {option}{name} {why}"), "{words}");
     }
     assert!(names.map(read) == before);
@@ -348,7 +348,10 @@ fn any_number_of_demonstrations_go_on_side_by_side() {
         demo.wait_for_loop();
         let said = demo.stderr();
         // The printed command shows its frames.
-        let line = said.lines().find_map(|line| line.strip_prefix("to see the decoded frames: ")).unwrap();
+        let line = said
+            .lines()
+            .find_map(|line| line.strip_prefix("to see the decoded frames, run in another shell: "))
+            .unwrap();
         let (directory, dump) = line.strip_prefix("SKINBUS_DIR=").unwrap().split_once(" skinbus ").unwrap();
         let mut dump = place.command("skinbus", &format!("{dump} --kind torque -n 3"));
         dump.env("SKINBUS_DIR", directory);

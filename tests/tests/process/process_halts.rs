@@ -137,7 +137,7 @@ fn a_lost_bus_that_halts_is_named_and_the_exit_code_is_that_of_the_halt() {
     let summary = place.summary();
     let halted = ended_halted(&ended, &summary, "too many bad cycles in a row: the torque is not valid");
     assert!(
-        ended.stderr.contains("\nskinbus: these buses were still lost when the run ended: vcan1\n"),
+        ended.stderr.contains("\nskinbus: these buses did not work when the run ended: vcan1\n"),
         "{ended:#?}"
     );
     let before = before(&summary, &halted);

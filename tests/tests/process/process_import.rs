@@ -323,7 +323,7 @@ fn each_covered_link_has_a_cell() {
         (
             "upper,fore",
             boxes,
-            "skinbus: --cover fore: the boxes of --keep-out leave nothing of it: make them smaller",
+            "skinbus: --cover fore: the boxes of --keep-out contain the whole link: make them smaller",
         ),
     ] {
         let output = cover(links, more);
@@ -406,8 +406,8 @@ fn torques_of_a_force_are_computed_in_both_ways() {
         ("1,1,0 0.5\n2,1,0 0.5\n", ", not \"1,1,0 0.5\": write the header above it"),
         (
             "cell,force_n,q\n1,1,0 0.5\nvcan0:2,96,0 0.5\n",
-            "skinbus: rows.csv, row 2: cell vcan0:2: force 96 N: the force against the outward normal must be 0 to \
-             95.997 N, what a cell's three contact sensors can report",
+            "skinbus: rows.csv, row 2: cell vcan0:2: force 96 N: the force against the outward normal must \
+             be 0 to 95.997 N, the most that a cell's three contact sensors can report",
         ),
         (
             "cell,force_n,q\n2,1,0 -6.3\n",

@@ -195,17 +195,23 @@ fn files_that_are_not_the_parts_of_one_recording_are_named() {
                 first to the last, or only one part";
     assert_eq!(refused("run-2.mcap run.mcap run-3.mcap"), said);
     fs::copy(place.path("run-1.mcap"), place.path("again.mcap")).unwrap();
-    let said = "skinbus: run-1.mcap and again.mcap are both part 1 of the recording: name one of them";
+    let said = "skinbus: run-1.mcap and again.mcap are both part 1 of the recording: name only one of them";
     assert_eq!(refused("run.mcap run-1.mcap again.mcap run-2.mcap"), said);
     let line = refused("run.mcap run-1.mcap run.log");
-    assert_eq!(line, "skinbus: run.mcap is a part of a recording, but run.log is not: name only the parts");
+    assert_eq!(
+        line,
+        "skinbus: run.mcap is one part of a split recording, but run.log is not a part of it: \
+                      name only parts of that recording"
+    );
     let line = refused("run.mcap nothing.mcap");
-    assert!(line.starts_with("skinbus: run.mcap is a file, but there is no file nothing.mcap: "), "{line}");
+    assert!(line.starts_with("skinbus: run.mcap is a file, but nothing.mcap is not: "), "{line}");
     fs::rename(place.path("run.mcap"), place.path("run-recovered.mcap")).unwrap();
     place.bench(0.1, "--record other.mcap").end().succeeded();
     let line = refused("other.mcap run-1.mcap");
     assert!(
-        line.starts_with("skinbus: other.mcap and run-1.mcap belong to different recordings, begun at "),
+        line.starts_with(
+            "skinbus: other.mcap and run-1.mcap belong to different recordings, which began at "
+        ),
         "{line}"
     );
     // The file name does not matter, and neither do missing parts at an end.

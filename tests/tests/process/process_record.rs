@@ -217,18 +217,12 @@ fn a_recording_that_exists_or_cannot_be_is_refused_before_anything_happens() {
     };
     place.write("old.mcap", "somebody's");
     let said = refused("--record old.mcap");
-    assert_eq!(
-        said,
-        "skinbus: --record old.mcap: it exists: name another file, or overwrite it with --overwrite"
-    );
+    assert_eq!(said, "skinbus: --record old.mcap: the file exists: name another file, or add --overwrite");
     place.write("late-1.mcap", "somebody's");
     assert!(refused("--record late.mcap").contains("late-1.mcap exists"));
     place.write("old.log", "somebody's");
     let said = refused("--candump old.log");
-    assert_eq!(
-        said,
-        "skinbus: --candump old.log: it exists: name another file, or overwrite it with --overwrite"
-    );
+    assert_eq!(said, "skinbus: --candump old.log: the file exists: name another file, or add --overwrite");
     assert_eq!(
         refused("--record run.log"),
         "skinbus: --record run.log: the name of a recording must end in .mcap"

@@ -40,8 +40,8 @@ fn an_invalid_skin_is_refused_with_line_key_value_and_what_is_allowed() {
     for (old, new, expected) in [
         ("node = 2\n", "node = 1\n", "cell[1].node = 1: cell[0] already has this node id on \"vcan0\""),
         ("node = 2\n", "node = 255\n", "cell[1].node = 255: must be 1 to 254"),
-        ("joint = 2\n", "joint = 7\n", "cell[0].joint = 7: the robot has joints 1 to 6"),
-        ("joint = 2\n", "joint = 0\n", "cell[0].joint = 0: the robot has joints 1 to 6"),
+        ("joint = 2\n", "joint = 7\n", "cell[0].joint = 7: use a joint from 1 to 6"),
+        ("joint = 2\n", "joint = 0\n", "cell[0].joint = 0: use a joint from 1 to 6"),
         (
             "orientation = [0.0, 0.0, 0.0, 1.0]",
             "orientation = [0.0, 0.0, 0.0, 0.9]",
@@ -51,8 +51,8 @@ fn an_invalid_skin_is_refused_with_line_key_value_and_what_is_allowed() {
         (
             "position = [",
             "position = [2.0, 0.0, 0.0]#[",
-            "cell[0].position = [2, 0, 0]: node 1 can be 2.000 m away from a frame of its rows, 0.001 m more \
-             than the 1.999 m that fit into Q1.14",
+            "cell[0].position = [2, 0, 0]: the distance from node 1 to a joint frame of its chain can reach \
+             2.000 m, 0.001 m more than Q1.14 can hold (1.999 m)",
         ),
         (
             "[controller]",
@@ -227,7 +227,7 @@ fn a_bus_that_does_not_exist_is_named_with_its_hint() {
     let said = refusal(&place, "cell-node", &format!("{cell} embedded"), 2);
     assert!(said.starts_with("cell-node: no embedded bus nosuch0 is served in "), "{said}");
     let said = refusal(&place, "cell-node", "--bus vcan7 --node 1 --skin skin.toml", 2);
-    assert_eq!(said, "cell-node: bus vcan7 is not in skin.toml, which has nosuch0");
+    assert_eq!(said, "cell-node: the skin file skin.toml has no bus vcan7; its buses are nosuch0");
     let said = refusal(&place, "cell-node", "--bus nosuch0 --nodes 2-9 --skin skin.toml", 2);
     assert_eq!(said, "cell-node: cell 4 is not on nosuch0 in skin.toml");
 }
@@ -241,7 +241,7 @@ fn buses_are_not_kept_where_others_may_look() {
     command.env("SKINBUS_DIR", place.path("open"));
     let ended = process::Running::start(command).end();
     let said = ended.refusal(2);
-    assert!(said.contains("but the bus must be private: `chmod 700` it, or set SKINBUS_DIR"), "{said}");
+    assert!(said.contains("so other users can open it: run `chmod 700` on it, or set SKINBUS_DIR"), "{said}");
     assert_eq!(place.files(), ["open", "scenario.toml", "skin.toml"]);
 }
 
@@ -255,13 +255,13 @@ fn an_unusable_socket_of_an_external_controller_is_named_before_cells_are_starte
         let external = format!("kind = \"external\"\nsocket = \"{socket}\"");
         place.write("skin.toml", &text.replace("kind = \"kinesthetic\"", &external));
         let said = refusal(&place, "skinbus", "run skin.toml --bus-kind embedded --candump run.log", 2);
-        assert_eq!(said, format!("skinbus: {socket}: {expected}"));
+        assert_eq!(said, format!("skinbus: {}", expected.replace("PATH", socket)));
     };
-    refused("nowhere/c.sock", "cannot listen on this socket: No such file or directory (os error 2)");
+    refused("nowhere/c.sock", "cannot listen on the socket PATH: No such file or directory (os error 2)");
     place.write("plain", "");
-    refused("plain", "exists and is not a socket, so it was left unchanged; choose another path");
+    refused("plain", "PATH exists and is not a socket, so it was left unchanged; choose another path");
     let _live = UnixDatagram::bind(place.path("live.sock")).unwrap();
-    refused("live.sock", "another program listens on this socket; stop it, or choose another path");
+    refused("live.sock", "another program listens on the socket PATH; stop it, or choose another path");
 }
 
 #[test]
@@ -277,8 +277,8 @@ fn wrong_options_are_one_line() {
         (
             "skinbus",
             "run skin.toml --bus-kind ethernet",
-            "invalid value 'ethernet' for '--bus-kind <[BUS=]KIND>': \"ethernet\" is not a kind of bus: use auto, socketcan or \
-             embedded; try '--help'"
+            "invalid value 'ethernet' for '--bus-kind <[BUS=]KIND>': \"ethernet\" is not a bus kind: use \
+             auto, socketcan or embedded; try '--help'"
                 .to_owned(),
         ),
         (
@@ -292,8 +292,8 @@ fn wrong_options_are_one_line() {
         (
             "cell-node",
             "--bus vcan0 --skin skin.toml --nodes 9-3",
-            "invalid value '9-3' for '--nodes <A-B>': give two node ids from 1 to 254, the smaller one \
-             first, such as 1-64; try '--help'"
+            "invalid value '9-3' for '--nodes <A-B>': use two node ids from 1 to 254, the smaller one first, \
+             such as 1-64; try '--help'"
                 .to_owned(),
         ),
         (

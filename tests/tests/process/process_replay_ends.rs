@@ -108,11 +108,11 @@ fn invalid_input_is_refused_in_one_line() {
         ("none.log", 1, "skinbus: none.log contains no frames"),
         ("nothing.log", 2, "skinbus: nothing.log: No such file"),
         ("some.zip", 2, "skinbus: some.zip is a zip"),
-        ("-", 2, "skinbus: a replay reads its capture twice, which is impossible with standard input"),
+        ("-", 2, "skinbus: a replay reads its input twice, which is impossible with standard input"),
         (
             "some.log --from 5",
             2,
-            "skinbus: --from and --to select no frames to send: some.log ends at 2.000 s",
+            "skinbus: there are no frames to send between --from and --to: some.log ends at 2.000 s",
         ),
         ("some.log --from 2 --to 1", 2, "skinbus: --from 2 must be before --to 1"),
         ("some.log --map can0=can1", 2, "skinbus: --map can0=can1: some.log has no bus can0; it has vcan0"),
@@ -120,7 +120,7 @@ fn invalid_input_is_refused_in_one_line() {
         (
             "some.log --map vcan0",
             2,
-            "skinbus: invalid value 'vcan0' for '--map <FROM=TO>': use a bus of the capture and",
+            "skinbus: invalid value 'vcan0' for '--map <FROM=TO>': use a recorded bus and the bus to",
         ),
         (
             "some.log --speed 101",
@@ -182,8 +182,8 @@ fn an_unreadable_line_is_named_and_omitted_and_times_that_run_backwards_are_repo
             "odd.log:2: column 4: expected digits of a second",
             "odd.log: lines skipped because they could not be read: 1",
             "odd.log: 7 frames are missing: they were lost during recording",
-            "odd.log: time stamps go backwards (first at frame 3, by 4.100 s): frames that are out of order are sent \
-             immediately",
+            "odd.log: time stamps go backwards (first at frame 3, by 4.100 s): a frame that is out of order \
+             is sent immediately",
         ]
     );
     assert_eq!((replayed.number("/sent"), replayed.number("/sent_at_once")), (5, 2), "{:#}", replayed.0);

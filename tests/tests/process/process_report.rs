@@ -192,11 +192,11 @@ fn figures_show_what_the_recording_holds_and_tables_what_the_gateway_counted() {
     assert_eq!(row(counts, "ticks skipped by the loop"), [counted("/loop/ticks_skipped")]);
     assert_eq!(row(counts, "vcan0: frames recorded"), [counted("/recording/frames")]);
     assert_eq!(
-        row(counts, "vcan0: packets that cells sent, by their own count"),
+        row(counts, "vcan0: packets that cells sent, according to their counters"),
         [counted("/buses/0/uplink/sent")]
     );
     let fact = |name: &str| &page.facts.iter().find(|(fact, _)| fact == name).unwrap().1;
-    assert!(fact("command of the run").contains("--record run.mcap"));
+    assert!(fact("command that started the run").contains("--record run.mcap"));
     assert!(fact("idle machine").contains("µs late (median)"));
 }
 

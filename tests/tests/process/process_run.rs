@@ -231,7 +231,7 @@ fn cells_that_measure_are_named_and_only_the_others_are_pressed() {
     let said = "these cells use their own sensors, so the scenario does not press them (`skinbus frame configure \
                 --cell N --write mode 1` puts one into test mode): 3 on vcan0\n";
     assert!(ended.stderr.contains(said), "{ended:#?}");
-    assert!(ended.stdout.contains("cells that measure"), "{}", ended.stdout);
+    assert!(ended.stdout.contains("cells in mode measure"), "{}", ended.stdout);
     let summary = place.summary();
     summary.adds_up().all_were_due(7, &ended.stderr);
     for (at, cell) in summary.cells().iter().enumerate() {

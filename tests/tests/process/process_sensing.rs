@@ -92,7 +92,8 @@ fn a_running_bench_is_switched_from_a_shell_for_one_cell_and_for_all() {
     (1..=CELLS).for_each(tells);
     assert_eq!(switches(&place, "off"), "8 cells on vcan0 (embedded): off\n");
 
-    let why = "skinbus: no answer from cell 99 on vcan0: start the cell, or give the bus's format with --format classic";
+    let why = "skinbus: cell 99 on vcan0 sent no answer: start the cell, or give the frame format of the bus \
+               with --format classic";
     assert_eq!(refusal(&place, "event --cell 99", 1), why);
     ends(bench);
     place.is_left_clean();
@@ -232,7 +233,7 @@ fn cells_that_were_pressed_before_are_compared_only_once_their_contact_is_known(
     assert!(ended.stderr.contains(said), "{}", ended.stderr);
     let summary = place.summary();
     let unknown = summary.of_bus("/replies/contact_unknown");
-    let reason = format!("{unknown} not due: the contact of their cells is unknown");
+    let reason = format!("{unknown} not due: it is unknown whether the cells were touched");
     assert!(unknown > 0 && ended.stdout.contains(&reason), "{}", ended.stdout);
     assert_eq!(summary.adds_up().of_bus("/replies/due"), 0, "{:#}", summary.0);
     assert_eq!(summary.number("/accuracy/single/count"), 0, "{:#}", summary.0);

@@ -228,7 +228,10 @@ fn one_bus_of_a_skin_is_shown_alone() {
     run.end();
     for (words, expected) in [
         ("view vcan1", "there is no file vcan1: name a skin (to show its buses), a recording, or a bus"),
-        ("view vcan7 --skin skin.toml", "bus vcan7 is not in skin.toml, which has vcan0, vcan1"),
+        (
+            "view vcan7 --skin skin.toml",
+            "the skin file skin.toml has no bus vcan7; its buses are vcan0, vcan1",
+        ),
         ("view vcan1 --skin skin.toml --at 3", "--at is only for a recording, not for live buses"),
     ] {
         let ended = place.start("skinbus", &format!("{words} --bus-kind embedded")).end();

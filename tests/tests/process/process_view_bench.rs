@@ -70,7 +70,10 @@ fn a_page_kills_stops_and_restarts_cells() {
 
     for (command, why) in [
         (r#"{"do":"link","cells":[1,2],"down":true}"#, "link down between cell 1 and cell 2 on vcan0: "),
-        (r#"{"do":"bus","bus":"vcan0","down":false}"#, "bus vcan0 up: no command has taken it down"),
+        (
+            r#"{"do":"bus","bus":"vcan0","down":false}"#,
+            "bus vcan0 up: only a bus that a command took down can be brought up",
+        ),
     ] {
         page.send(command);
         assert!(!page.answer(why), "{why}");
@@ -133,7 +136,7 @@ fn a_bus_that_a_page_takes_down_stays_down_until_it_takes_it_up() {
     assert!(run.stderr().contains(&format!("the robot is halted: {};", why(&said).unwrap())), "{said}");
     assert!(!served(), "it is not served again by itself");
     page.send(r#"{"do":"bus","bus":"vcan0","down":true}"#);
-    assert!(!page.answer("it is already down"));
+    assert!(!page.answer("the bus is already down"));
 
     page.send(r#"{"do":"bus","bus":"vcan0","down":false}"#);
     assert!(page.answer("bus vcan0 up"));
@@ -222,7 +225,11 @@ fn a_link_that_a_page_takes_down_leaves_a_cell_unreachable() {
     let link =
         |down: bool, one: u8, other: u8| format!(r#"{{"do":"link","cells":[{one},{other}],"down":{down}}}"#);
     page.send(&link(true, 1, 12));
-    assert!(!page.answer("link down between cell 1 and cell 12 on vcan0: the skin has no wire between them"));
+    assert!(
+        !page.answer(
+            "link down between cell 1 and cell 12 on vcan0: the skin has no wire between these cells"
+        )
+    );
     page.send(&link(true, 4, 3));
     page.send(&link(true, 8, 4));
     run.wait_for_stderr("view: link down between cell 4 and cell 3 on vcan0");

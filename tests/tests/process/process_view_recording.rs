@@ -137,7 +137,7 @@ fn what_cannot_be_shown_is_named() {
         ),
         ("view /dev/null", "/dev/null is not a regular file: name a skin, to show its buses, or a recording"),
         ("view -", "there is no file -: name a skin (to show its buses), a recording, or a bus with --skin"),
-        ("view text.log text.log", "text.log is named twice: name it once"),
+        ("view text.log text.log", "the file text.log is named twice: name it once"),
     ] {
         let ended = place.start("skinbus", words).end();
         assert!(ended.refusal(2).contains(expected), "{words}: {}", ended.refusal(2));

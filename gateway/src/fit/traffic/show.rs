@@ -63,7 +63,12 @@ pub(super) fn format_report(name: &str, what: &str, missing: u64, report: &Shado
     for bus in &report.buses {
         bus_rows(&mut rows, bus, report);
     }
-    rows.add_row_unless_zero("frames of further buses", report.frames_of_other_buses, "beyond the first 64");
+    rows.add_row_unless_zero(
+        "frames of other buses",
+        report.frames_of_other_buses,
+        "only the first 64 \
+                                                                                       buses are shown",
+    );
     rows.to_text()
 }
 
@@ -85,22 +90,22 @@ fn bus_rows(rows: &mut KeyValueTable, bus: &BusShadow, report: &ShadowReport) {
     }
     if bit_error_rate > 0.0 {
         let each = format!("bit error rate {bit_error_rate:e}");
-        rows.add_row("damaged, and retransmitted", format!("{} attempts", bus.counts.damaged), each);
+        rows.add_row("frames sent again", format!("{} attempts", bus.counts.damaged), each);
     }
     add_bench_traffic_row(rows, bus);
     let of_all =
         |count: u64| format!("{:.1} % of the frames", 100.0 * count as f64 / bus.frames.max(1) as f64);
     rows.add_row_unless_zero(
-        "left out: error frames",
+        "error frames, left out",
         bus.counts.error_frames,
         "reported by a driver, not sent on the bus",
     );
+    rows.add_row_unless_zero("frames out of order", bus.counts.out_of_order, of_all(bus.counts.out_of_order));
     rows.add_row_unless_zero(
-        "out of order, and sorted",
-        bus.counts.out_of_order,
-        of_all(bus.counts.out_of_order),
+        "  too late to sort",
+        bus.counts.too_late_to_sort,
+        "counted as if they came later",
     );
-    rows.add_row_unless_zero("  too late to sort", bus.counts.too_late_to_sort, "counted at a later time");
     rows.add_row_unless_zero("never sent", bus.counts.no_room, "because 4 million frames already waited");
 }
 
@@ -108,7 +113,7 @@ fn bus_rows(rows: &mut KeyValueTable, bus: &BusShadow, report: &ShadowReport) {
 fn add_fit_rows(rows: &mut KeyValueTable, bus: &BusShadow, has_times: bool) {
     match (&bus.worst_case, &bus.answering) {
         (Some(worst), _) => rows.add_row(worst.case_name(), worst.table_value(), worst.cells),
-        (None, Some(_)) => rows.add_row("worst case", "?", "needs a skin with this bus: use --skin"),
+        (None, Some(_)) => rows.add_row("worst case", "?", "name a skin with this bus: --skin"),
         (None, None) => {}
     }
     match &bus.this_run {
@@ -126,11 +131,11 @@ fn add_fit_rows(rows: &mut KeyValueTable, bus: &BusShadow, has_times: bool) {
             );
         }
         Some(AnsweringCounts { epochs, epochs_halted, mean: Some(mean), .. }) => {
-            let beside = format!("{epochs} joints messages, without {epochs_halted} sent while halted");
+            let beside = format!("{epochs} joints messages; {epochs_halted} more while halted");
             rows.add_row("  cells that answered", format!("{mean:.1} on average"), beside);
         }
         Some(AnsweringCounts { epochs_halted: halted @ 1.., mean: None, .. }) => {
-            rows.add_row("  cells that answered", "halted all the time", format!("{halted} joints messages"));
+            rows.add_row("  cells that answered", "none, always halted", format!("{halted} joints messages"));
         }
         _ => {}
     }
@@ -140,7 +145,7 @@ fn add_operation_rows(rows: &mut KeyValueTable, bus: &BusShadow) {
     add_load_rows(rows, bus, &bus.load, ("average load", &format!("{:.3} s in operation", bus.operation_s)));
     rows.add_row("  bus busy", format_share(bus.load.busy), "");
     add_busy_stretch_row(rows, bus, &bus.stretches);
-    rows.add_row("delay, µs", "50 % / 99 % / max", "from request to end of frame");
+    rows.add_row("delay, µs", "50 % / 99 % / max", "from queueing to end of frame");
     rows.add_row("  all frames", format_delays(&bus.delay_us), format!("{} frames", bus.delay_us.count));
     for kind in &bus.kinds {
         let (name, delay) = (kind.kind, &kind.delay_us);
@@ -169,7 +174,7 @@ fn add_bench_traffic_row(rows: &mut KeyValueTable, bus: &BusShadow) {
     if bus.counts.bench.total() == 0 {
         return;
     }
-    let name = if bus.counts.bench_omitted { "left out: bench traffic" } else { "counted: bench traffic" };
+    let name = if bus.counts.bench_omitted { "bench frames, left out" } else { "bench frames, counted" };
     let parts = [("stimuli", stimuli), ("sync", syncs), ("report", reports), ("simulated wires", wires)];
     let parts = parts.iter().filter(|it| it.1 > 0).map(|(what, count)| format!("{count} {what}"));
     rows.add_row(name, format!("{} frames", bus.counts.bench.total()), comma_separated(parts));
@@ -178,12 +183,12 @@ fn add_bench_traffic_row(rows: &mut KeyValueTable, bus: &BusShadow) {
 fn add_load_rows(rows: &mut KeyValueTable, bus: &BusShadow, load: &Loads, (name, beside): (&str, &str)) {
     rows.add_row(name, format_share(load.mean), beside);
     rows.add_row(
-        "  most in any 16 ms",
+        "  highest in any 16 ms",
         format_percent(load.worst_16_ms.value),
         format_peak_time(bus, load.worst_16_ms),
     );
     rows.add_row(
-        "  most in any second",
+        "  highest in any second",
         format_percent(load.worst_1_s.value),
         format_peak_time(bus, load.worst_1_s),
     );
@@ -205,7 +210,7 @@ fn add_answer_rows(rows: &mut KeyValueTable, replies: &ReplyStatistics) {
     rows.add_row("answers after joints, µs", format_delays(after_joints_us), "50 % / 99 % / max");
     let beside = [
         Some("after the next joints message".to_owned()),
-        (*late_when_ready > 0).then(|| format!("{late_when_ready} not caused by the bus")),
+        (*late_when_ready > 0).then(|| format!("{late_when_ready} not because of the bus")),
         (*late_before > 0).then(|| format!("{late_before} others were already late in the recording")),
     ];
     rows.add_row("  late", format!("{late} of {count}"), comma_separated(beside.into_iter().flatten()));

@@ -55,7 +55,7 @@ fn add_packet_rows(rows: &mut KeyValueTable, bus: &BusSummary, lost: u64) {
     let up = &bus.uplink;
     rows.add_row("packets sent by cells", up.sent, "according to their own counters");
     rows.add_row("  delivered", up.delivered, format!("{} rejected", up.rejected));
-    rows.add_row_unless_zero("  for other cells", up.unheard, "sums that the gateway does not receive");
+    rows.add_row_unless_zero("  sums to other cells", up.unheard, "not received by the gateway");
     let reasons = [
         (up.dropped, "dropped by the bus"),
         (up.backlog, "dropped by the kernel's backlog"),
@@ -68,5 +68,5 @@ fn add_packet_rows(rows: &mut KeyValueTable, bus: &BusSummary, lost: u64) {
     rows.add_row_unless_zero("  from other senders", up.outsiders, "");
     rows.add_row_unless_zero("  in doubt", up.in_doubt, "sent just before a restart");
     rows.add_row_unless_zero("  after the last heartbeat", up.unsettled, "");
-    rows.add_row_unless_zero("  restarts of cells", up.restarts, "packets sent just before are in doubt");
+    rows.add_row_unless_zero("  restarts of cells", up.restarts, "packets sent just before may be lost");
 }

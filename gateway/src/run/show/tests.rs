@@ -149,7 +149,7 @@ fn verbose_has_all_rows() {
         "received",
         "private memory",
         "start to first broadcast",
-        "frames in every format",
+        "frames recorded",
     ];
     for row in usual {
         assert!(verbose.contains(row) && !brief.contains(row), "{row}\n{brief}\n{verbose}");
@@ -167,11 +167,11 @@ fn what_is_not_usual_is_shown_without_verbose() {
     let changes: [Change; 11] = [
         (|it| it.control.ticks_skipped = 3, "3 skipped"),
         (|it| it.control.unsent = 1, "frames not sent"),
-        (|it| it.control.records_lost = 1, "records of ticks lost"),
+        (|it| it.control.records_lost = 1, "tick records lost"),
         (|it| it.accuracy.saturated = 1, "saturated words"),
         (
             |it| it.buses[0].outages = OutagesSummary { times: 1, lost_s: 0.5, at_end: false, ticks: 1 },
-            "1 tick without the bus",
+            "1 tick ran without this bus",
         ),
         (|it| it.buses[0].silent_cells = vec![7], "silent cells"),
         (|it| (it.buses[0].replies.in_time, it.buses[0].replies.late) = (17_771, 1), "1 late"),

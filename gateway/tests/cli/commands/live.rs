@@ -155,16 +155,23 @@ fn a_cell_that_is_requested_answers_and_one_that_is_not_there_is_missed() {
         bench.beside(format, || {
             let read = says(&format!("frame configure --cell 12 --read mount --tag 7 {with}"));
             assert_eq!((read.0, read.2.as_str()), (Some(0), ""));
-            assert!(read.1.starts_with("configured 12 tag 7: has mount: joint 2 of 6") && read.1.lines().count() == 1, "{read:?}");
+            assert!(
+                read.1.starts_with("configured 12 tag 7: has mount: joint 2 of 6")
+                    && read.1.lines().count() == 1,
+                "{read:?}"
+            );
             let all = says(&format!("frame configure --cell everyone --read mount {with}"));
             assert_eq!((all.0, all.1.lines().count()), (Some(0), 1), "{all:?}");
             let refused = says(&format!("frame configure --cell 12 --write mode 1 {with}"));
-            assert!(refused.0 == Some(1) && refused.2.starts_with("skinbus: configured 12 tag 0: "), "{refused:?}");
+            assert!(
+                refused.0 == Some(1) && refused.2.starts_with("skinbus: configured 12 tag 0: "),
+                "{refused:?}"
+            );
             let nobody = says(&format!("frame stimulus --cell 250 {with}"));
             assert_eq!((nobody.0, nobody.1.as_str()), (Some(1), ""));
             let expected = format!(
-                "skinbus: cell 250 sent nothing on vcan0 for 1 s: `skinbus cells vcan0` lists the cells; if the bus \
-                 has another frame format, use --format {}\n",
+                "skinbus: cell 250 sent nothing on vcan0 for 1 s: check the cells with `skinbus cells \
+                 vcan0`; if the bus uses the other frame format, add --format {}\n",
                 format.other_format().name()
             );
             assert_eq!(nobody.2, expected);
@@ -242,7 +249,7 @@ fn cells_on_a_foreign_bus_reports_that_frames_came_and_none_of_a_cell() {
     let said = text(&stderr);
     assert_eq!(status.code(), Some(1), "{said}");
     assert!(
-        said.contains(" frames are not from cells; `skinbus dump` shows them): start the cells"),
+        said.contains(" other frames were received; `skinbus dump` shows them): start the cells"),
         "{said}"
     );
 }
@@ -332,9 +339,13 @@ fn the_bus_of_a_cell_is_where_a_frame_is_sent() {
     assert!(both.to_string().contains("vcan1"), "{both}");
     for (arguments, expected) in [
         ("--cell vcan1:5 --bus vcan0", "--cell vcan1:5 is not on --bus vcan0: correct --cell or --bus"),
-        (&format!("--cell 1 --skin {skin}"), "--cell 1 is on several buses: choose one of vcan0:1, vcan1:1"),
+        (
+            &format!("--cell 1 --skin {skin}"),
+            "--cell 1: several buses have a cell with this node id; choose \
+                                              one of vcan0:1, vcan1:1",
+        ),
         (&format!("--cell 99 --skin {skin}"), "--cell 99: the skin has no such cell on vcan0, vcan1"),
-        (&format!("--cell vcan7:1 --skin {skin}"), "bus vcan7 is not in "),
+        (&format!("--cell vcan7:1 --skin {skin}"), "the skin file "),
     ] {
         let Output { status, stderr, .. } =
             bench.gateway(&format!("frame stimulus {arguments}")).output().unwrap();
@@ -347,14 +358,8 @@ fn the_bus_of_a_cell_is_where_a_frame_is_sent() {
 fn what_the_options_of_a_dump_leave_out_is_said() {
     let bench = Bench::new();
     for (arguments, expected) in [
-        (
-            "vcan0 --bus vcan1",
-            "skinbus: bus vcan1 is not among the dumped buses: name it in addition to vcan0\n",
-        ),
-        (
-            "vcan0 --cell vcan1:3",
-            "skinbus: bus vcan1 is not among the dumped buses: name it in addition to vcan0\n",
-        ),
+        ("vcan0 --bus vcan1", "skinbus: bus vcan1 is not one of the buses to dump (vcan0): name it too\n"),
+        ("vcan0 --cell vcan1:3", "skinbus: bus vcan1 is not one of the buses to dump (vcan0): name it too\n"),
         (
             "vcan0 --bus vcan0 --cell vcan1:3",
             "skinbus: vcan1:3 is not on a selected bus (vcan0): omit one of the two filters\n",
@@ -434,8 +439,8 @@ fn a_dump_reports_lost_frames_though_its_bus_has_ended() {
     let said = text(&stderr);
     let missing = said.strip_prefix("vcan0: ").and_then(|said| {
         said.strip_suffix(
-            " frames are missing: they arrived faster than they were shown\n\
-             skinbus: the embedded bus vcan0 was closed: its server ended\n",
+            " frames are missing, because they arrived faster than they were shown\nskinbus: the embedded \
+             bus vcan0 was closed: its server ended\n",
         )
     });
     let missing: u32 = missing.unwrap_or_else(|| panic!("{said}")).parse().unwrap();

@@ -83,7 +83,7 @@ fn an_identifier_that_does_not_fit_is_named_and_no_frame() {
     let (code, out, said) = run(&folder, "convert id_needs_29_bits.mcap -");
     assert_eq!((code, out.as_str()), (Some(1), ""));
     assert!(said.contains("18F010FE does not fit an identifier of 11 bits: at most 7FF"), "{said}");
-    assert!(said.ends_with("skinbus: id_needs_29_bits.mcap: it contains no frame\n"), "{said}");
+    assert!(said.ends_with("skinbus: id_needs_29_bits.mcap: it contains no CAN frames\n"), "{said}");
 }
 
 #[test]
@@ -120,12 +120,16 @@ fn times_that_are_none_get_a_remark_and_no_verdict() {
         ("none.txt", none.as_bytes()),
     ]);
     for (name, remark) in [
-        ("zero.txt", "all 300 frames of can0 have the time 0.000000000: rates, gaps and loads mean nothing"),
+        (
+            "zero.txt",
+            "all 300 frames of can0 have the same time, 0.000000000: rates, gaps and bus loads are meaningless",
+        ),
         (
             "one.txt",
-            "all 300 frames of can0 have the time 1700000000.500000000: rates, gaps and loads mean nothing",
+            "all 300 frames of can0 have the same time, 1700000000.500000000: rates, gaps and bus loads are \
+             meaningless",
         ),
-        ("none.txt", "rates, gaps and loads mean nothing"),
+        ("none.txt", "rates, gaps and bus loads are meaningless"),
     ] {
         let (code, out, said) = run(&folder, &format!("fit {name} --nominal 500k"));
         assert!(code == Some(0) && said.contains(remark), "{said}");
@@ -186,7 +190,7 @@ fn a_name_that_was_changed_is_what_is_said() {
         (code, out.as_str()),
         (Some(0), "(1700000000.000000000) _/robot_one/can 123#0102030405060708\n")
     );
-    assert!(said.contains("1 frame has a bus whose name was changed"), "{said}");
+    assert!(said.contains("1 frame is from a bus whose name was changed"), "{said}");
     assert!(!said.contains("direction"), "{said}");
 }
 
@@ -209,10 +213,10 @@ fn files_of_one_capture_are_read_in_the_order_of_their_frames() {
             .ends_with("is already an MCAP recording: copy it instead")
     );
     let said = folder.refuses("convert split_0.mcap split_0.mcap x.log", 2);
-    assert_eq!(said, "skinbus: split_0.mcap is named twice: name it once");
+    assert_eq!(said, "skinbus: the file split_0.mcap is named twice: name it once");
     let said = folder.refuses("convert split_0.mcap three_digits.log x.log", 2);
     assert!(
-        said.starts_with("skinbus: three_digits.log is a candump log, and split_0.mcap an MCAP recording"),
+        said.starts_with("skinbus: three_digits.log is a candump log, but split_0.mcap is an MCAP recording"),
         "{said}"
     );
 }
@@ -228,15 +232,20 @@ fn logs_that_overlap_are_read_one_after_the_other_and_that_is_said() {
     ]);
     let (code, out, said) = run(&folder, "convert c.log b.log a.log -");
     assert_eq!((code, out.as_str()), (Some(0), format!("{a}{b}\n(7.000000) can0 007#\n").as_str()));
-    assert!(said.contains("b.log begins before a.log ends: they are read one after the other"), "{said}");
     assert!(
-        said.contains("the time runs backwards 1 times, first at frame 3; the order of the frames is kept"),
+        said.contains("b.log begins before a.log ends: the files are read one after the other"),
+        "{said}"
+    );
+    assert!(
+        said.contains(
+            "the time stamps go backwards 1 times, first at frame 3; the order of the frames is kept"
+        ),
         "{said}"
     );
     let (_, _, said) = run(&folder, "convert a.log c.log -");
     assert_eq!(said, "a.log to c.log (2 parts) -> -: 3 frames, 0 notes\n");
     let (_, _, said) = run(&folder, "dump b.log c.log a.log");
-    assert!(said.contains("the time runs backwards 1 times"), "{said}");
+    assert!(said.contains("the time stamps go backwards 1 times"), "{said}");
 }
 
 #[test]
@@ -334,7 +343,7 @@ fn what_came_through_a_pipe_outlives_a_killed_convert() {
         let said = folder.refuses("convert - run.mcap", 2);
         assert!(
             said.contains(
-                "run.mcap.part was left by a program that was killed: recover it with `skinbus recover"
+                "run.mcap.part was left by a conversion that was killed: recover it with `skinbus recover"
             ),
             "{said}"
         );

@@ -102,7 +102,10 @@ fn a_link_a_file_in_the_way_and_a_path_that_is_too_long_are_refused() {
     drop(protocol::bus::embedded::make_directory(&real).unwrap());
     std::os::unix::fs::symlink(&real, &link).unwrap();
     let error = ServerThread::start_in(&link, BUS).unwrap_err().to_string();
-    assert!(error.starts_with(&format!("cannot use the directory {} for embedded buses", link.display())), "{error}");
+    assert!(
+        error.starts_with(&format!("cannot use the directory {} for embedded buses", link.display())),
+        "{error}"
+    );
 
     std::fs::write(real.join("vcan0.bus"), "").unwrap();
     let error = ServerThread::start_in(&real, BUS).unwrap_err().to_string();
