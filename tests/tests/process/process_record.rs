@@ -263,7 +263,10 @@ fn a_file_that_another_program_moves_while_it_is_written_counts_as_lost_and_the_
     let of = |key: &str| summary.number(&format!("/recording/{key}"));
     assert_eq!((of("lost_write"), of("frames")), (moved, kept), "{:#}", summary.0);
     let why = summary.0["recording"]["errors"][0].as_str().unwrap();
-    assert!(why.starts_with("run.mcap.part: another program renamed, removed or replaced it"), "{why}");
+    assert!(
+        why.starts_with("run.mcap.part: another program renamed, removed or replaced this file"),
+        "{why}"
+    );
     assert!(!place.path("run.mcap").exists());
 }
 
