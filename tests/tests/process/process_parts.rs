@@ -179,7 +179,8 @@ fn explain_dump_and_report_take_a_part_and_all_of_them() {
         let files: Vec<_> = files.split(' ').map(|name| place.path(name)).collect();
         let report = report(&files, &ReportOptions::default()).unwrap();
         let findings = report.page.sections.iter().flat_map(|section| &section.findings);
-        let mut found = findings.filter(|finding| finding.what.starts_with("lost packets of cells"));
+        let mut found = findings
+            .filter(|finding| finding.what.starts_with("lost packets, according to the cells' counters"));
         assert!(found.next().unwrap().ours.value <= lost as f64, "{files:?}");
     }
     place.start("skinbus", &format!("report {parts}")).end().succeeded();

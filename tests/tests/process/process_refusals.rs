@@ -229,7 +229,7 @@ fn a_bus_that_does_not_exist_is_named_with_its_hint() {
     let said = refusal(&place, "cell-node", "--bus vcan7 --node 1 --skin skin.toml", 2);
     assert_eq!(said, "cell-node: the skin file skin.toml has no bus vcan7; its buses are nosuch0");
     let said = refusal(&place, "cell-node", "--bus nosuch0 --nodes 2-9 --skin skin.toml", 2);
-    assert_eq!(said, "cell-node: cell 4 is not on nosuch0 in skin.toml");
+    assert_eq!(said, "cell-node: the skin file skin.toml has no cell 4 on bus nosuch0");
 }
 
 #[test]
