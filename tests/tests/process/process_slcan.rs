@@ -438,7 +438,7 @@ fn what_cannot_be_is_refused_in_one_line() {
     );
     assert_eq!(
         refused(&format!("{tty} --cell 1 --cell 2"), 2),
-        "vcan-setup: 2 --cell options for 1 lines: give one for each line, or write /dev/ttyACM0,cell=12"
+        "vcan-setup: there are 2 --cell options for 1 lines: give one for each line, or write /dev/ttyACM0,cell=12"
     );
     assert!(refused("ttyACM0", 2).contains("\"ttyACM0\" is not a line: use a form such as /dev/ttyACM0"));
     assert!(

@@ -214,7 +214,7 @@ impl fmt::Display for LineAccount {
     /// Writes three lines, or four if the adapter reported faults, without a line feed at the end.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { line, opened, lost, reopened, to_line, to_bus, faults } = self;
-        write!(f, "{line}: opened {}, lost the connection {}", times_text(*opened), times_text(*lost))?;
+        write!(f, "{line}: opened {}, lost {}", times_text(*opened), times_text(*lost))?;
         if *reopened > 0 {
             write!(f, ", reopened {} because the adapter refused frames", times_text(*reopened))?;
         }
@@ -246,7 +246,7 @@ mod tests {
             LineAccount { line: "/dev/ttyACM0".to_owned(), opened: 2, lost: 1, ..LineAccount::default() };
         assert_eq!(
             account.to_string(),
-            "/dev/ttyACM0: opened 2 times, lost the connection once\n  to the line: 0 received, 0 sent\n  to \
+            "/dev/ttyACM0: opened 2 times, lost once\n  to the line: 0 received, 0 sent\n  to \
              the bus:  0 received, 0 sent"
         );
         account.to_line = BusToLineCounts {
@@ -272,7 +272,7 @@ mod tests {
         };
         assert_eq!(
             account.to_string(),
-            "/dev/ttyACM0: opened 2 times, lost the connection once\n  to the line: 23 received, 1 sent, 22 \
+            "/dev/ttyACM0: opened 2 times, lost once\n  to the line: 23 received, 1 sent, 22 \
              dropped (line too slow: 1, line unavailable: 2, FD frames, but the adapter is classic: 3, error \
              frames: 4, refused by the adapter: 7, still queued at the end: 5), 6 not received (dropped by \
              the bus: 6)\n  to the bus:  11 received, 1 sent, 10 dropped (bus queue full: 1, bus \
@@ -283,7 +283,7 @@ mod tests {
         let text = account.to_string();
         assert!(
             text.starts_with(
-                "/dev/ttyACM0: opened 2 times, lost the connection once, reopened once because \
+                "/dev/ttyACM0: opened 2 times, lost once, reopened once because \
                               the adapter refused frames\n"
             ),
             "{text}"
