@@ -48,7 +48,7 @@ impl fmt::Display for LineEvent {
             Self::Lost { to_line, to_bus, account } => {
                 let one = |count: u64, what, so_far: String| {
                     let so_far = so_far.trim_start_matches(", ");
-                    (count > 0).then(|| format!("{count} more {what} were lost; total: {so_far}"))
+                    (count > 0).then(|| format!("{count} more {what} lost; total: {so_far}"))
                 };
                 let lost = [
                     one(*to_line, "frames to the line", account.to_line.losses()),

@@ -246,7 +246,7 @@ mod tests {
         for gone in gone {
             let (said, frames, lost) = disturbed(gone);
             assert_eq!((said.len(), frames, lost), (1, None, 8), "{said:?}");
-            assert!(said[0].starts_with("another program renamed, removed or replaced it"), "{said:?}");
+            assert!(said[0].starts_with("another program renamed, removed or replaced the file"), "{said:?}");
         }
         let (said, frames, lost) = disturbed(|path| fs::write(path, "").unwrap());
         assert_eq!((said.len(), frames, lost), (1, Some(3), 5), "{said:?}");

@@ -185,9 +185,8 @@ fn a_file_that_takes_a_name_meanwhile_keeps_it() {
     let (part, _file) = PartFile::create(goal.clone()).unwrap();
     fs::remove_file(&part.path).unwrap();
     fs::write(&part.path, "somebody's").unwrap();
-    assert!(
-        part.finish(true).unwrap_err().to_string().ends_with("another program has replaced run.mcap.part")
-    );
+    let expected = format!("another program has replaced {}", part.path.display());
+    assert_eq!(part.finish(true).unwrap_err().to_string(), expected);
     assert!(part.open().is_err());
     part.remove();
     assert_eq!(fs::read(&part.path).unwrap(), b"somebody's");

@@ -40,7 +40,7 @@ pub(super) fn write_neighbors(
             number => write!(f, "{number}")?,
         }
         f.write_str(match (part("other_version"), part("works")) {
-            (1, _) => " (other protocol version)",
+            (1, _) => " (other version)",
             (_, 0) => " (one direction only)",
             _ => "",
         })?;

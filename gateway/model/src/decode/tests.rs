@@ -186,9 +186,8 @@ fn every_other_kind_has_its_text() {
             (
                 "ports from=12 epoch=7 port0=3/2/hears+works port1=0/0/none port2=254/3/hears \
                  port3=7/0/hears+other-version changes=2",
-                "ok      network 12 epoch 7 ports: 0 leads to port 2 of 3, 1 silent, 2 leads to port 3 of \
-                 254 (one direction only), 3 leads to port 0 of 7 (other protocol version); parent changed 2 \
-                 times",
+                "ok      network 12 epoch 7 ports: 0 leads to port 2 of 3, 1 silent, 2 leads to port 3 of 254 (one \
+                 direction only), 3 leads to port 0 of 7 (other version); parent changed 2 times",
             ),
             (
                 "ports from=1 epoch=0 port0=0/4/hears+works port1=0/0/none port2=0/0/none port3=0/0/none changes=0",

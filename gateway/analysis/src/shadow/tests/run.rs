@@ -326,5 +326,7 @@ fn another_protocol_is_counted_in_full_whatever_it_looks_like() {
         (shadow.counts.sent, shadow.counts.bench.total(), shadow.start_up.is_none()),
         (3_000, 0, true)
     );
-    assert!(shadow.this_run.unwrap().to_string().contains(" of classic 1M: fits (another protocol)"));
+    assert!(
+        shadow.this_run.unwrap().to_string().contains(" of classic 1M: fits (frames of another protocol)")
+    );
 }
