@@ -250,7 +250,7 @@ mod tests {
         }
         let (said, frames, lost) = disturbed(|path| fs::write(path, "").unwrap());
         assert_eq!((said.len(), frames, lost), (1, Some(3), 5), "{said:?}");
-        assert!(said[0].starts_with("another program changed it"), "{said:?}");
+        assert!(said[0].starts_with("another program changed the file"), "{said:?}");
     }
 
     #[test]
