@@ -1,18 +1,21 @@
 //! The files of the pages. They are served one by one, or bundled into one script for a page without a server.
 
 /// The files of the live page, and of the page that shows a skin without buses.
-const WEB_FILES: [(&str, &str); 25] = [
+const WEB_FILES: [(&str, &str); 28] = [
     ("index.html", include_str!("../web/index.html")),
     ("still.html", include_str!("../web/still.html")),
     ("style.css", include_str!("../web/style.css")),
     ("app.js", include_str!("../web/app.js")),
+    ("arrows.js", include_str!("../web/arrows.js")),
     ("bench.js", include_str!("../web/bench.js")),
     ("camera.js", include_str!("../web/camera.js")),
     ("colours.js", include_str!("../web/colours.js")),
     ("dom.js", include_str!("../web/dom.js")),
     ("frames.js", include_str!("../web/frames.js")),
     ("gl.js", include_str!("../web/gl.js")),
+    ("ground.js", include_str!("../web/ground.js")),
     ("halted.js", include_str!("../web/halted.js")),
+    ("health.js", include_str!("../web/health.js")),
     ("legend.js", include_str!("../web/legend.js")),
     ("link.js", include_str!("../web/link.js")),
     ("math.js", include_str!("../web/math.js")),

@@ -1,26 +1,31 @@
 // The page: keeps the newest messages, and draws when something has changed.
 
+import { arrows, axesOf, roundUp } from "./arrows.js";
 import { Bench, nameOf } from "./bench.js";
-import { Camera } from "./camera.js";
-import { SHOWS, css, ramp } from "./colours.js";
+import { AHEAD_S, Camera } from "./camera.js";
+import { SHOWS, css, isDark, onScheme, ramp } from "./colours.js";
 import { hold } from "./frames.js";
+import { axes as axesSeen } from "./ground.js";
+import { Health } from "./health.js";
 import { shapes } from "./legend.js";
 import { Link } from "./link.js";
-import { point, project } from "./math.js";
+import { direction, point, project } from "./math.js";
 import { Painter } from "./pace.js";
 import { Picture } from "./picture.js";
 import { Plots, number } from "./plots.js";
 import { TimeBar } from "./time.js";
-import { extent, frames } from "./robot.js";
+import { cylinders, facing, frames, outline, placed } from "./robot.js";
 import { listen, pick } from "./touch.js";
 import { wires } from "./wires.js";
 import * as words from "./words.js";
 
 const $ = (id) => document.getElementById(id);
-const canvas = $("picture"), camera = new Camera();
+const canvas = $("picture"), camera = new Camera(), health = new Health();
+// What the picture shows of the scene: its outline, its links, its joints' axes; the pose, and the one to expect.
+let parts = [], links = [], turning = [], pose = new Float64Array(), soon = pose, poses = [], drawnAt = 0, jumps = true, most = 1, shownArrows = null;
 let picture = null, scene = null, plots = null, snapshot = null, said = null, all = null, trees = [], chosen = -1, pressed = -1;
 // For browser tests.
-window.skinbus = { frames: 0, snapshots: 0, where, joints: () => snapshot?.joints.map((joint) => joint.position) ?? [] };
+window.skinbus = { frames: 0, snapshots: 0, where, camera, filled: () => filled(), joints: () => snapshot?.joints.map((joint) => joint.position) ?? [] };
 
 function message(text) {
   $("message").textContent = text;
@@ -44,23 +49,100 @@ function draw(ratio) {
   const news = said;
   if (news) {
     said = null;
+    health.begin(snapshot.time);
+    health.follow(scene, news.buses);
     words.say(scene, news, ask);
     bench.say(scene, news.bench, chosen);
     trees = news.buses.map((bus) => bus.tree);
     $("tree-switch").hidden = trees.every((tree) => !tree);
     drawTree();
     plots.draw();
-    camera.fit(extent(scene, all));
   }
+  follow();
   picture?.update(snapshot.cells, SHOWS[$("shows").value], chosen);
+  point3d();
   const drew = picture?.draw(view(), all, ratio) ?? false;
+  if (drew) triad();
   if (drew || news) window.skinbus.frames++;
+  if (camera.moves) setTimeout(redraw);
   return { drew, worked: news !== null };
+}
+
+// Moves the camera to where the robot is now.
+function follow() {
+  const now = performance.now(), seconds = Math.min(0.5, (now - drawnAt) / 1000);
+  drawnAt = now;
+  // Without new snapshots the robot stands still.
+  const stands = !poses[1] || now - poses[1].at > 200;
+  camera.follow(pose, stands ? pose : soon, seconds, now, canvas.clientWidth, canvas.clientHeight, jumps);
+  if (jumps) picture?.lay(camera.size, floor());
+  jumps = false;
+}
+
+// The height of the ground: that of the base, or of anything that is below it at first.
+const floor = () => Math.min(0, pose.reduce((low, v, i) => (i % 3 === 2 ? Math.min(low, v) : low), Infinity));
+
+// Keeps a new pose, and estimates the next one from how fast the joints move.
+function placeRobot(joints) {
+  const now = performance.now(), before = poses[1], passed = before ? (now - before.at) / 1000 : 0;
+  poses = [before, { at: now, joints }];
+  pose = placed(parts, all);
+  soon = passed > 0.005 && passed < 0.5 ? placed(parts, frames(scene, joints.map((q, j) => q + (q - before.joints[j]) / passed * AHEAD_S))) : pose;
+}
+
+// Draws the arrows of a new snapshot.
+function point3d() {
+  const dark = isDark(), late = health.lateJoints(), state = `${snapshot.number} ${snapshot.time} ${dark} ${$("arrows").checked} ${[...late]}`;
+  if (!picture || state === shownArrows) return;
+  shownArrows = state;
+  const shown = $("arrows").checked;
+  most = Math.max(most, roundUp(Math.max(1, ...snapshot.joints.map((joint) => Math.abs(joint.distributed)))));
+  picture.point(arrows(scene, turning, all, snapshot, { dark, force: shown, torque: shown && picture.theme.torque, alarm: picture.theme.alarm, most, late }));
+  $("turn").textContent = `${Number(most.toPrecision(3))} ${scene.joints[0]?.torque_unit ?? "Nm"}`;
+}
+
+// Draws the axes of the robot's base in the corner.
+function triad() {
+  const at = axesSeen(camera.basis());
+  for (const { name, x, y, deep } of at) {
+    const line = $(`axis-${name}`), text = $(`name-${name}`);
+    for (const [key, value] of [["x2", x * 22], ["y2", y * 22], ["opacity", deep < 0 ? 0.6 : 1]]) line.setAttribute(key, String(value));
+    text.setAttribute("x", String(x * 30));
+    text.setAttribute("y", String(y * 30 + 4));
+  }
+}
+
+// The share of the picture that the robot's box fills along its larger side, and the farthest that it is outside, in
+// pixels.
+function filled() {
+  const { clientWidth: w, clientHeight: h } = canvas, box = [Infinity, Infinity, -Infinity, -Infinity], m = view();
+  for (let i = 0; i < pose.length; i += 3) {
+    const [x, y] = project(m, pose.slice(i, i + 3), w, h) ?? [-w, -h];
+    [x, y].forEach((v, k) => { box[k] = Math.min(box[k], v); box[k + 2] = Math.max(box[k + 2], v); });
+  }
+  return [Math.max((box[2] - box[0]) / w, (box[3] - box[1]) / h), Math.max(-box[0], -box[1], box[2] - w, box[3] - h)];
 }
 
 const name = (i) => (i < 0 ? "" : nameOf(scene, scene.cells[i]));
 
-function choose(i) {
+// The share of the view's choice that touched cells have, beside all others.
+const TOUCHED = 30;
+
+// Looks from where most of the skin is seen, and above all the cells that are touched.
+function direct(words) {
+  camera.choose(scene.cells.map((cell, i) => [direction(all[scene.buses[cell.bus].chain][cell.row], cell.normal), words[2 * i] >>> 16 ? TOUCHED : 1]));
+}
+
+// Turns to a cell whose front is not seen.
+function turnTo(i) {
+  const to = i >= 0 && all ? facing(scene, all, links, i, camera) : null;
+  if (!to) return;
+  camera.turnTo(to.yaw, to.pitch, matchMedia("(prefers-reduced-motion: reduce)").matches);
+  redraw();
+}
+
+function choose(i, turns = true) {
+  if (turns) turnTo(i);
   if (i === chosen) return;
   chosen = i;
   words.chosen(name(i));
@@ -70,8 +152,8 @@ function choose(i) {
   redraw();
 }
 
-function press(i) {
-  choose(i);
+function press(i, turns = false) {
+  choose(i, turns);
   if (!scene.may_press) return;
   pressed = i;
   link.send({ do: "press", cell: name(i), force_n: Number($("force").value) });
@@ -100,14 +182,22 @@ function drawTree() {
 async function surface(of) {
   const answer = await fetch(`/surface${location.search}`);
   const corners = new Float32Array(await answer.arrayBuffer());
-  if (answer.ok && scene === of) picture.surface(corners);
+  if (answer.ok && scene === of) {
+    picture.surface(corners);
+    parts = outline(scene, corners);
+    if (all) pose = soon = placed(parts, all);
+    jumps = true;
+  }
   redraw();
 }
 
 const link = new Link({
   scene(it) {
     scene = it;
-    [chosen, pressed, snapshot, said, camera.box] = [-1, -1, null, null, null];
+    [chosen, pressed, snapshot, said, all, jumps, most, poses, shownArrows] = [-1, -1, null, null, null, true, 1, [], null];
+    [parts, links, turning] = [outline(scene), cylinders(scene), axesOf(scene)];
+    camera.fit();
+    health.forget();
     document.title = `${scene.name}: skinbus view`;
     $("name").textContent = scene.name;
     plots = new Plots($("torques"), scene.joints);
@@ -120,12 +210,18 @@ const link = new Link({
   },
   snapshot(it) {
     snapshot = it;
-    all = frames(scene, it.joints.map((joint) => joint.position));
+    const joints = it.joints.map((joint) => joint.position), first = !all;
+    all = frames(scene, joints);
+    placeRobot(joints);
+    if (first || jumps && camera.auto && camera.steers) direct(it.cells);
     plots.push(it.time, it.joints);
     window.skinbus.snapshots++;
     redraw();
   },
-  history(it) { plots.replace(it); },
+  history(it) {
+    plots.replace(it);
+    [jumps, poses] = [true, []];
+  },
   said(it) {
     said = it;
     time.say(it.playback);
@@ -148,11 +244,19 @@ listen(canvas, {
   at: (x, y) => (scene && all ? pick(scene, all, camera, view(), canvas.clientWidth, canvas.clientHeight, x, y) : -1),
   press,
   release,
-  turn(dx, dy) { camera.turn(dx, dy); redraw(); },
+  turn(dx, dy) { camera.turn(dx, dy, performance.now()); redraw(); },
   zoom(by) { camera.nearer(by); redraw(); },
+  fit,
   next(step) { if (scene) choose((chosen + step + scene.cells.length) % scene.cells.length); },
   pressChosen() { if (chosen >= 0) press(chosen); },
 });
+
+function fit() {
+  camera.fit();
+  redraw();
+}
+$("fit").onclick = fit;
+$("arrows").onchange = redraw;
 
 $("force").oninput = () => {
   $("newtons").textContent = `${Number($("force").value).toFixed(1)} N`;
@@ -184,7 +288,7 @@ function legend() {
   $("low").textContent = number(shows.low).replace(/\.0+$/, "");
   $("high").textContent = `${number(shows.high).replace(/\.0+$/, "")} ${shows.unit}`;
   for (let x = 0; x < width; x++) {
-    pen.fillStyle = `rgb(${ramp(x / (width - 1)).join(" ")})`;
+    pen.fillStyle = `rgb(${ramp(x / (width - 1), isDark()).join(" ")})`;
     pen.fillRect(x, 0, 1, height);
   }
   redraw();
@@ -193,4 +297,8 @@ $("shows").onchange = legend;
 $("tree").onchange = () => { drawTree(); redraw(); };
 legend();
 shapes($("shapes"), css);
-matchMedia("(prefers-color-scheme: dark)").onchange = () => { if (scene) picture?.colours(); shapes($("shapes"), css); redraw(); };
+onScheme(() => {
+  if (scene) picture?.colours();
+  shapes($("shapes"), css);
+  legend();
+});

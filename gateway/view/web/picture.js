@@ -1,7 +1,9 @@
 // Draws the robot and its cells with WebGL2.
 
-import { colourOf, css, rgb, shapeOf } from "./colours.js";
+import { FLOATS as ARROW_FLOATS } from "./arrows.js";
+import { colourOf, css, isDark, rgb, shapeOf } from "./colours.js";
 import { context, floats, program } from "./gl.js";
+import { ground } from "./ground.js";
 import { atlas } from "./numbers.js";
 import { cellOf } from "./snapshot.js";
 import { add } from "./math.js";
@@ -86,6 +88,12 @@ void main() {
   o = vec4(it == ${CUT} || it == ${MOVED} ? alarm : mark, 1.);
 }`];
 
+// Lines and arrows, whose corners have colours of their own.
+const PLAIN = [`layout(location=0) in vec3 at; layout(location=1) in vec3 colour; uniform mat4 view; out vec3 c;
+void main() { c = colour; gl_Position = view * vec4(at, 1.); }`,
+`in vec3 c; out vec4 o;
+void main() { o = vec4(c, 1.); }`];
+
 // The form of a cell: its hexagon, or a triangle around it. A software renderer fills only the pixels of the hexagon.
 const corner = (degrees, far) => [far * Math.cos(degrees * Math.PI / 180), far * Math.sin(degrees * Math.PI / 180)];
 const HEXAGON = { corners: [0, 60, 120, 180, 240, 300].map((at) => corner(at, 1)), fan: [0, 1, 2, 0, 2, 3, 0, 3, 4, 0, 4, 5] };
@@ -103,19 +111,16 @@ export class Picture {
   // Sets the scene, which does not change.
   set(scene) {
     const { gl } = this;
-    [this.scene, this.before] = [scene, null];
+    [this.scene, this.before, this.laid] = [scene, null, null];
     this.solid = program(gl, SOLID);
     this.cell = program(gl, CELL, ...(this.numbers ? ["NUMBERS"] : []));
     this.wire = program(gl, WIRE);
+    this.plain = program(gl, PLAIN);
     this.wires = [];
+    this.ground = this.buffer([[0, 3, 0], [1, 3, 12]], 24);
+    this.arrows = this.buffer([[0, 3, 0], [1, 3, 12]], 4 * ARROW_FLOATS);
     if (this.numbers) atlas(gl);
-    this.ribbon = { vao: gl.createVertexArray(), buffer: gl.createBuffer() };
-    gl.bindVertexArray(this.ribbon.vao);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.ribbon.buffer);
-    for (const [at, size, offset] of [[0, 3, 0], [1, 2, 12]]) {
-      gl.enableVertexAttribArray(at);
-      gl.vertexAttribPointer(at, size, gl.FLOAT, false, FLOATS * 4, offset);
-    }
+    this.ribbon = this.buffer([[0, 3, 0], [1, 2, 12]], FLOATS * 4);
     this.round = this.solids(cylinders(scene));
     this.shells = null;
     // Cells by frame: `order` has their indices in the scene.
@@ -153,6 +158,37 @@ export class Picture {
     this.colours();
   }
 
+  // A buffer of corners that change, with its attributes as [location, number of floats, offset].
+  buffer(layout, stride) {
+    const { gl } = this, it = { vao: gl.createVertexArray(), buffer: gl.createBuffer(), count: 0 };
+    gl.bindVertexArray(it.vao);
+    gl.bindBuffer(gl.ARRAY_BUFFER, it.buffer);
+    for (const [at, size, offset] of layout) {
+      gl.enableVertexAttribArray(at);
+      gl.vertexAttribPointer(at, size, gl.FLOAT, false, stride, offset);
+    }
+    return it;
+  }
+
+  fill(it, corners, floats) {
+    const { gl } = this;
+    it.count = corners.length / floats;
+    gl.bindBuffer(gl.ARRAY_BUFFER, it.buffer);
+    gl.bufferData(gl.ARRAY_BUFFER, corners, gl.DYNAMIC_DRAW);
+    this.changed = true;
+  }
+
+  // Lays the ground at a height below a robot of this size.
+  lay(size, height) {
+    this.laid = [size, height];
+    this.fill(this.ground, ground(size, height, this.theme.back, this.theme.grid), 6);
+  }
+
+  // Sets the arrows to draw.
+  point(corners) {
+    if (corners.length || this.arrows.count) this.fill(this.arrows, corners, ARROW_FLOATS);
+  }
+
   // All cells of one frame are drawn at once.
   solids(all) {
     const { gl } = this, parts = new Map();
@@ -188,7 +224,8 @@ export class Picture {
   colours() {
     this.changed = true;
     const colour = (name) => rgb(css(name)).map((v) => v / 255);
-    this.theme = { back: colour("--back"), robot: colour("--robot"), unlit: rgb(css("--unlit")), mark: colour("--mark"), edge: colour("--edge"), chosen: colour("--chosen"), alarm: colour("--alarm") };
+    this.theme = { back: colour("--back"), robot: colour("--robot"), unlit: rgb(css("--unlit")), mark: colour("--mark"), edge: colour("--edge"), chosen: colour("--chosen"), alarm: colour("--alarm"), grid: colour("--grid"), torque: colour("--torque"), dark: isDark() };
+    if (this.laid) this.lay(...this.laid);
   }
 
   // Sets the cells of a snapshot, in the scene's order. Unchanged cells are skipped.
@@ -199,7 +236,7 @@ export class Picture {
     order.forEach((i, at) => {
       const one = same && (i === chosen) === (i === before.chosen);
       if (one && words[2 * i] === before.words[2 * i] && words[2 * i + 1] === before.words[2 * i + 1]) return;
-      const cell = cellOf(words, i), [r, g, b] = colourOf(shows, cell, scene.cells[i]) ?? theme.unlit;
+      const cell = cellOf(words, i), [r, g, b] = colourOf(shows, cell, scene.cells[i], theme.dark) ?? theme.unlit;
       const kind = shapeOf(cell).shape | (i === chosen ? 16 : 0) | (cell.flags & 16 ? 32 : 0) | (scene.cells[i].root ? 64 : 0);
       looks.fill((r | g << 8 | b << 16 | kind << 24) >>> 0, at * vertices, (at + 1) * vertices);
       [first, end] = [Math.min(first, at), at + 1];
@@ -258,6 +295,13 @@ export class Picture {
       gl.drawArrays(gl.TRIANGLES, first, count);
     }
     gl.disable(gl.CULL_FACE);
+    gl.useProgram(this.plain.program);
+    gl.uniformMatrix4fv(this.plain.view, false, view);
+    for (const [{ vao, count }, kind] of [[this.arrows, gl.TRIANGLES], [this.ground, gl.LINES]]) {
+      if (!count) continue;
+      gl.bindVertexArray(vao);
+      gl.drawArrays(kind, 0, count);
+    }
     return true;
   }
 }

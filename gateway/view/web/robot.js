@@ -1,6 +1,6 @@
 // The poses of a robot's links, and their shapes.
 
-import { add, cross, dot, length, point, row, times, unit } from "./math.js";
+import { add, cross, direction, dot, length, point, row, times, unit } from "./math.js";
 
 // The frame of each row of each chain, the base first.
 export function frames(scene, positions) {
@@ -88,11 +88,78 @@ export function triangles({ from, to, radius }) {
   return out;
 }
 
-// The corners of the box around everything that is drawn, in the current pose.
-export function extent(scene, all) {
-  const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
-  const take = (p) => p.forEach((v, i) => { low[i] = Math.min(low[i], v); high[i] = Math.max(high[i], v); });
-  scene.chains.forEach((_, c) => all[c].forEach((m) => take(point(m, [0, 0, 0]))));
-  for (const cell of scene.cells) take(point(all[scene.buses[cell.bus].chain][cell.row], cell.position));
-  return { low, high };
+// Directions in which a part's outline is sought: about even over the sphere.
+const WAYS = Array.from({ length: 60 }, (_, i) => {
+  const z = 1 - (2 * i + 1) / 60, r = Math.sqrt(1 - z * z), turn = i * 2.399963;
+  return [r * Math.cos(turn), r * Math.sin(turn), z];
+});
+
+// The outline of everything that is drawn, as { chain, row, points } in the frame of each row: of each part's corners,
+// those that are outermost in some direction. `corners` are those of the robot's surface, six numbers each.
+export function outline(scene, corners = null) {
+  const parts = new Map();
+  const take = (chain, row, p) => {
+    const key = `${chain} ${row}`;
+    if (!parts.has(key)) parts.set(key, { chain, row, most: WAYS.map(() => -Infinity), points: [] });
+    const { most, points } = parts.get(key);
+    WAYS.forEach((way, k) => { const far = dot(way, p); if (far > most[k]) { most[k] = far; points[k] = p; } });
+  };
+  for (const { bus, row, position } of scene.cells) take(scene.buses[bus].chain, row, position);
+  if (corners) {
+    for (const { chain, row, first, count } of scene.shells) {
+      for (let i = first; i < first + count; i++) take(chain, row, [corners[6 * i], corners[6 * i + 1], corners[6 * i + 2]]);
+    }
+  } else {
+    for (const it of cylinders(scene)) {
+      const all = triangles(it);
+      for (let i = 0; i < all.length; i += 6) take(it.chain, it.row, all.slice(i, i + 3));
+    }
+  }
+  return [...parts.values()].map(({ chain, row, points }) => ({ chain, row, points: [...new Set(points)] }));
+}
+
+// The points of an outline in the current pose, three numbers each.
+export function placed(parts, all) {
+  const out = new Float64Array(3 * parts.reduce((sum, { points }) => sum + points.length, 0));
+  let k = 0;
+  for (const { chain, row, points } of parts) {
+    for (const p of points) { out.set(point(all[chain][row], p), k); k += 3; }
+  }
+  return out;
+}
+
+// Returns true if a ray from a point in a direction, of this length, passes through a link. Links are cylinders here.
+function passes(from, way, links) {
+  return links.some(({ a, axis, long, radius }) => {
+    const off = add(from, a, -1), u = add(way, axis, -dot(way, axis)), v = add(off, axis, -dot(off, axis));
+    const aa = dot(u, u), b = dot(u, v), c = dot(v, v) - radius * radius, root = b * b - aa * c;
+    if (aa < 1e-12 || root < 0) return false;
+    return [-1, 1].some((sign) => {
+      const t = (-b + sign * Math.sqrt(root)) / aa, along = dot(add(off, way, t), axis);
+      return t > 1e-3 && along > 0 && along < long;
+    });
+  });
+}
+
+// The direction from which the front of a cell is seen that is nearest to the current one, as { yaw, pitch }; null if it
+// is seen already. `links` are the cylinders of the robot.
+export function facing(scene, all, links, i, { yaw, pitch }) {
+  const { bus, row, position, normal } = scene.cells[i], { chain } = scene.buses[bus], m = all[chain][row];
+  const [place, front] = [point(m, position), unit(direction(m, normal))], from = add(place, front, 0.004);
+  const solid = links.map((it) => {
+    const [a, b] = [it.from, it.to].map((p) => point(all[it.chain][it.row], p)), axis = add(b, a, -1);
+    return { a, axis: unit(axis), long: length(axis), radius: it.radius * 0.98 };
+  });
+  const way = (yaw, pitch) => [Math.cos(pitch) * Math.cos(yaw), Math.cos(pitch) * Math.sin(yaw), Math.sin(pitch)];
+  const shows = (to, least) => dot(front, to) > least && !passes(from, to, solid);
+  const now = way(yaw, pitch);
+  if (shows(now, 0.35)) return null;
+  let best = null, most = -Infinity;
+  for (const p of [0.3, 0.6, 0.9, 0.05, -0.3, 1.2, -0.8]) {
+    for (let k = 0; k < 36; k++) {
+      const y = yaw + k * Math.PI / 18, to = way(y, p), worth = dot(to, now) + 0.8 * dot(to, front) - 0.3 * Math.max(0, 0.1 - p);
+      if (worth > most && shows(to, 0.55)) [best, most] = [{ yaw: y, pitch: p }, worth];
+    }
+  }
+  return best ?? { yaw: Math.atan2(front[1], front[0]), pitch: Math.asin(front[2]) };
 }

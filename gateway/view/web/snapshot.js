@@ -28,6 +28,9 @@ export function decodeHistory(buffer) {
 
 export const isHistory = (buffer) => new DataView(buffer).getUint32(12, true) === 1;
 
+// The status of a cell from which frames have stopped coming.
+export const DEAD = 4;
+
 // A cell of a snapshot, which has two words for it.
 export function cellOf(words, i) {
   const [low, high] = [words[2 * i], words[2 * i + 1]];

@@ -1,13 +1,13 @@
 // A skin at rest: the page contains all data and needs no server.
 
 import { Camera } from "./camera.js";
-import { SHOWS, css } from "./colours.js";
+import { SHOWS, css, onScheme } from "./colours.js";
 import { element, table } from "./dom.js";
 import { busKey, shapes } from "./legend.js";
 import { direction, point, project } from "./math.js";
 import { Painter } from "./pace.js";
 import { Picture } from "./picture.js";
-import { extent, frames, indices } from "./robot.js";
+import { frames, indices, outline, placed } from "./robot.js";
 import { resting } from "./snapshot.js";
 import { listen, pick } from "./touch.js";
 import { MOVED, wired } from "./wires.js";
@@ -27,20 +27,28 @@ const frame = ({ bus, row }) => all[scene.buses[bus].chain][row];
 const name = (cell) => `${scene.buses[cell.bus].name}:${cell.node}`;
 const found = (x, y) => pick(scene, all, camera, view(), ...size(), x, y);
 
+const corners = scene.shells.length ? new Float32Array(Uint8Array.from(atob(surface), (letter) => letter.charCodeAt(0)).buffer) : null;
+
 try {
   picture = new Picture(canvas, true);
   picture.set(scene);
-  if (scene.shells.length) picture.surface(new Float32Array(Uint8Array.from(atob(surface), (letter) => letter.charCodeAt(0)).buffer));
+  if (corners) picture.surface(corners);
   picture.ribbons([...wires, ...moved.map(({ cell, ...from }) => ({ from, to: cell, kind: MOVED }))]);
 } catch (error) {
   picture = null;
   $("message").textContent = `The picture cannot be drawn: ${error.message}. The tables still work.`;
   $("message").hidden = false;
 }
-camera.fit(extent(scene, all));
-camera.most = Math.max(camera.most, camera.size / scene.pitch);
+const pose = placed(outline(scene, corners), all);
+camera.choose(cells.map((cell) => [direction(frame(cell), cell.normal), 1]));
 
 const painter = new Painter(picture?.software ?? false, (ratio) => {
+  const first = camera.fresh;
+  camera.follow(pose, pose, 0, 0, ...size());
+  if (first && camera.auto) {
+    camera.closest = Math.min(camera.closest, scene.pitch / camera.size);
+    picture?.lay(camera.size, Math.min(0, pose.reduce((low, v, i) => (i % 3 === 2 ? Math.min(low, v) : low), Infinity)));
+  }
   picture?.update(words, SHOWS.bus, chosen);
   const drew = picture?.draw(view(), all, ratio) ?? false;
   if (drew) window.skinbus.frames++;
@@ -112,6 +120,11 @@ $("find").onsubmit = (event) => {
   $("cell").replaceChildren(element("p", `There is no cell ${text}.`, "bad"));
 };
 
+function fit() {
+  camera.fit();
+  redraw();
+}
+
 // Zooms, by default around the middle.
 function zoom(by, x = canvas.clientWidth / 2, y = canvas.clientHeight / 2) {
   camera.nearer(by, [x - canvas.clientWidth / 2, y - canvas.clientHeight / 2], ...size());
@@ -124,13 +137,14 @@ listen(canvas, {
   turn(dx, dy) { camera.turn(dx, dy); redraw(); },
   move(dx, dy) { camera.move(dx, dy, ...size()); redraw(); },
   zoom,
+  fit,
   next(step) { if (cells.length) choose((chosen + step + cells.length) % cells.length, true); },
   pressChosen() {},
   release() {},
 });
 $("in").onclick = () => zoom(1.4);
 $("out").onclick = () => zoom(1 / 1.4);
-$("whole").onclick = () => { camera.whole(); redraw(); };
+$("whole").onclick = fit;
 new ResizeObserver(redraw).observe(canvas);
 window.addEventListener("hashchange", follow);
 
@@ -144,5 +158,5 @@ $("buses").replaceChildren(...scene.buses.map((bus, index) => {
 const marks = [{ name: "root", mark: "root" }, { name: "other cell", mark: "" }];
 if (moved.length) marks.push({ name: "moved from its place in the skin", mark: "way" });
 shapes($("shapes"), css, marks);
-matchMedia("(prefers-color-scheme: dark)").onchange = () => { picture?.colours(); shapes($("shapes"), css, marks); redraw(); };
+onScheme(() => { picture?.colours(); shapes($("shapes"), css, marks); redraw(); });
 follow();

@@ -5,12 +5,13 @@ import { add, direction, dot, point, project } from "./math.js";
 // The cell at a point of the picture, among those that are hit from their front: of the cells within a pitch of the one nearest to
 // the eye, the one whose centre is nearest to the point.
 export function pick(scene, frames, camera, view, width, height, x, y) {
-  const eye = camera.eye(), hit = [];
+  // The length of the view's second row is its focal length.
+  const eye = camera.eye(), hit = [], focus = Math.hypot(view[1], view[5], view[9]);
   scene.cells.forEach((cell, i) => {
     const m = frames[scene.buses[cell.bus].chain][cell.row], at = point(m, cell.position);
     const seen = project(view, at, width, height);
     if (!seen) return;
-    const radius = Math.max(6, scene.pitch * 0.56 / seen[2] * height / 2 * Math.min(2, 2 * width / height));
+    const radius = Math.max(6, scene.pitch * 0.56 / seen[2] * height / 2 * focus);
     const off = Math.hypot(seen[0] - x, seen[1] - y);
     if (off <= radius && dot(direction(m, cell.normal), add(eye, at, -1)) > 0) hit.push({ i, off, far: seen[2] });
   });
@@ -74,6 +75,7 @@ export function listen(canvas, on) {
     if (turns[key]) on.turn(...turns[key]);
     else if (key === "+" || key === "=") on.zoom(1.2);
     else if (key === "-") on.zoom(1 / 1.2);
+    else if (key === "f") on.fit();
     else if (key === "n" || key === "p") on.next(key === "n" ? 1 : -1);
     else if (key === " ") { if (!event.repeat) on.pressChosen(); }
     else if (key === "Escape") on.release();

@@ -3,16 +3,20 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 
 import { about, allowed, isDown, processOf } from "../bench.js";
-import { Camera } from "../camera.js";
+import { arrows, axesOf, roundUp } from "../arrows.js";
+import { AHEAD_S, Camera } from "../camera.js";
 import { BUSES, SHAPES, SHOWS, busColour, colourOf, ramp, shapeOf } from "../colours.js";
+import { axes as axesSeen, ground, spacing } from "../ground.js";
 import { haltedWords } from "../halted.js";
-import { cross, dot, look, perspective, point, project, row, times, unit } from "../math.js";
+import { Health } from "../health.js";
+import { cross, direction, dot, look, perspective, point, project, row, times, unit } from "../math.js";
 import { Pace, SOFTWARE_HZ } from "../pace.js";
-import { axes, cylinders, extent, frames, neighbors, triangles } from "../robot.js";
+import { axes, cylinders, facing, frames, neighbors, outline, placed, triangles } from "../robot.js";
 import { cellOf, decode, decodeHistory } from "../snapshot.js";
 import { pick } from "../touch.js";
 import { number } from "../plots.js";
 import { clock, requested } from "../time.js";
+import { arms, demo } from "./motions.mjs";
 import { CUT, FLOATS, MOVED, TREE, WIRE, ribbons, wired, wires } from "../wires.js";
 
 const close = (a, b, within = 1e-9) => a.forEach((v, i) => assert.ok(Math.abs(v - b[i]) < within, `${a} ${b}`));
@@ -90,9 +94,12 @@ test("a cell's shape says the worst about it, and each shape is another", () => 
   assert.equal(new Set(SHAPES.map((it) => it.shape)).size, SHAPES.length);
 });
 
-test("colours grow lighter with the value, and values beyond the range have its ends", () => {
-  const light = (share) => { const [r, g, b] = ramp(share); return 0.3 * r + 0.6 * g + 0.1 * b; };
-  for (let share = 0.05; share <= 1; share += 0.05) assert.ok(light(share) > light(share - 0.05));
+test("colours grow lighter with the value on a dark page and darker on a light one, and values beyond the range have its ends", () => {
+  const light = (share, dark) => { const [r, g, b] = ramp(share, dark); return 0.3 * r + 0.6 * g + 0.1 * b; };
+  for (let share = 0.05; share <= 1; share += 0.05) {
+    assert.ok(light(share, true) > light(share - 0.05, true));
+    assert.ok(light(share, false) < light(share - 0.05, false));
+  }
   assert.deepEqual([ramp(-1), ramp(9)], [ramp(0), ramp(1)]);
 });
 
@@ -113,30 +120,79 @@ test("the nearest cell that faces the eye is picked", () => {
   });
 });
 
-test("the camera shows all of the robot until somebody moves it", () => {
-  const it = scene(), all = frames(it, [0.3, -1.2, 1, -1.4, -1.5, 0.2]), camera = new Camera();
-  camera.fit(extent(it, all));
-  for (const m of all[0]) {
-    for (const [w, h] of [[1000, 800], [390, 500]]) {
-      const [x, y] = project(camera.matrix(w, h), point(m, [0, 0, 0]), w, h);
-      assert.ok(x > 0 && x < w && y > 0 && y < h, `${x} ${y}`);
-    }
+// The share of the picture that the robot's box fills along its larger side, and how far it is outside in pixels.
+function filled(camera, pose, w, h) {
+  const box = [Infinity, Infinity, -Infinity, -Infinity], view = camera.matrix(w, h);
+  for (let i = 0; i < pose.length; i += 3) {
+    project(view, pose.slice(i, i + 3), w, h).slice(0, 2).forEach((v, k) => { box[k] = Math.min(box[k], v); box[k + 2] = Math.max(box[k + 2], v); });
   }
-  // It stands still while the robot moves where it has been.
-  const elsewhere = extent(it, frames(it, [1.3, -0.2, 1, -1.4, -1.5, 0.2]));
-  camera.fit(elsewhere);
-  const { middle, size } = camera;
-  camera.fit(extent(it, all));
-  camera.fit(elsewhere);
-  assert.deepEqual([camera.middle, camera.size], [middle, size]);
-  camera.turn(10, 10);
-  camera.fit({ low: [9, 9, 9], high: [10, 10, 10] });
-  assert.deepEqual(camera.middle, middle);
+  return [Math.max((box[2] - box[0]) / w, (box[3] - box[1]) / h), Math.max(-box[0], -box[1], box[2] - w, box[3] - h)];
+}
+
+for (const [name, { scene: it, at }] of Object.entries({ demo, arms })) {
+  test(`the picture is filled by the robot and holds it, and zooms calmly: ${name}`, () => {
+    const parts = outline(it), place = (q) => placed(parts, frames(it, q));
+    const q = (t) => { const k = Math.min(at.length - 2, Math.floor(t * 10)); return at[k].map((v, j) => v + (at[k + 1][j] - v) * (t * 10 - k)); };
+    for (const [w, h] of [[1000, 560], [1520, 780], [390, 470]]) {
+      for (const hz of [15, 30]) {
+        const camera = new Camera();
+        let before = null;
+        for (let t = 0; t < (at.length - 2) / 10; t += 1 / hz) {
+          const now = q(t), last = q(Math.max(0, t - 1 / hz)), next = now.map((v, j) => v + (v - last[j]) * hz * AHEAD_S);
+          if (!t) camera.choose([[[0, -1, 0], 1]]);
+          camera.follow(place(now), place(next), 1 / hz, 1e9, w, h);
+          const [share, outside] = filled(camera, place(now), w, h), said = `${w} x ${h}, ${hz} Hz, ${t.toFixed(2)} s`;
+          assert.ok(share >= 0.7, `${share} of the picture, ${said}`);
+          assert.ok(outside <= 0, `${outside} px outside, ${said}`);
+          const zoom = before === null ? 0 : Math.abs(Math.log(camera.distance / before)) * hz;
+          assert.ok(zoom <= Math.log(1.2) + 1e-9, `${zoom}, ${said}`);
+          before = camera.distance;
+        }
+      }
+    }
+  });
+}
+
+test("a user's view stays where it is until it is to fit again, and a turned view stays filled", () => {
+  const { scene: it, at } = demo, pose = placed(outline(it), frames(it, at[0])), [w, h] = [1000, 600];
+  const camera = new Camera(), follow = (seconds = 0.05, now = 1e9) => camera.follow(pose, pose, seconds, now, w, h);
+  follow();
+  camera.turn(200, 0, 1e9);
+  for (let k = 0; k < 40; k++) follow();
+  assert.ok(filled(camera, pose, w, h)[0] > 0.75);
+  const { yaw } = camera;
+  camera.nearer(3, [0, 0], w, h);
+  const { middle, distance } = camera;
+  follow();
+  assert.deepEqual([camera.yaw, camera.middle, camera.distance], [yaw, middle, distance]);
+  camera.fit();
+  follow();
+  assert.ok(Math.abs(filled(camera, pose, w, h)[0] - 0.84) < 1e-6);
+  camera.turnTo(2, 0.4, false);
+  assert.ok(camera.moves);
+  for (let k = 0; k < 60; k++) follow();
+  close([Math.cos(camera.yaw), Math.sin(camera.yaw), camera.pitch], [Math.cos(2), Math.sin(2), 0.4]);
+  assert.ok(!camera.moves);
+});
+
+test("a cell behind its link, or turned away, is turned to", () => {
+  const { scene: of, at } = demo, [tube] = of.tubes, all = frames(of, at[0]), links = cylinders(of);
+  const middle = [0, 1, 2].map((i) => (tube.ends[0][i] + tube.ends[1][i]) / 2), axis = unit([0, 1, 2].map((i) => tube.ends[1][i] - tube.ends[0][i]));
+  for (let k = 0; k < 12; k++) {
+    const out = unit(cross(axis, [Math.cos(k), Math.sin(k), 0.3])), position = middle.map((v, i) => v + out[i] * tube.radius / 0.97);
+    const it = { ...of, cells: [{ bus: 0, node: 1, row: tube.row, joint: 2, position, normal: out, neighbors: [], root: false }] };
+    const normal = direction(all[0][tube.row], out), way = ({ yaw, pitch }) => [Math.cos(pitch) * Math.cos(yaw), Math.cos(pitch) * Math.sin(yaw), Math.sin(pitch)];
+    const from = { yaw: Math.atan2(-normal[1], -normal[0]), pitch: 0 }, to = facing(it, all, links, 0, from);
+    assert.ok(to && dot(way(to), normal) > 0.5, "its front is seen");
+    assert.equal(facing(it, all, links, 0, to), null, "what is seen needs no turn");
+  }
 });
 
 test("a zoom keeps what is under the pointer, a drag moves it, and a cell is faced", () => {
   const camera = new Camera(), [w, h] = [1000, 800];
-  camera.fit({ low: [-0.5, -0.5, 0], high: [0.5, 0.5, 1] });
+  const box = [-0.5, 0.5].flatMap((x) => [-0.5, 0.5].flatMap((y) => [0, 1].flatMap((z) => [x, y, z])));
+  const follow = () => camera.follow(box, box, 0, 0, w, h);
+  follow();
   const seen = (p) => project(camera.matrix(w, h), p, w, h).slice(0, 2);
   // A point in the plane of the middle, which is seen to the right and above.
   const up = cross(camera.toward(), unit(cross([0, 0, 1], camera.toward())));
@@ -150,8 +206,46 @@ test("a zoom keeps what is under the pointer, a drag moves it, and a cell is fac
   camera.face([0.1, 0.2, 0.3], [0, 1, 0], 0.015, 20, w, h);
   close(seen([0.1, 0.2, 0.3]), [w / 2, h / 2], 1e-6);
   assert.ok(camera.grain(w, h) * 20 <= 0.015 * 1.0001 && dot(camera.toward(), [0, 1, 0]) > 0.9);
-  camera.whole();
-  assert.deepEqual([camera.zoom, camera.middle], [1, [0, 0, 0.5]]);
+  camera.fit();
+  follow();
+  const [share, outside] = filled(camera, box, w, h);
+  assert.ok(Math.abs(share - 0.84) < 1e-6 && outside < 0);
+});
+
+test("arrows show contact forces and torques about the joints' axes, and gaps in them late replies", () => {
+  const { scene: of, at } = demo, all = frames(of, at[0]);
+  const it = { ...of, cells: [1, 2, 3].map((node) => ({ bus: 0, node, row: 2, joint: 2, position: [0, 0, 0.07], normal: [0, 0, 1], neighbors: [], root: false })) };
+  const joints = of.joints.map((_, j) => ({ position: at[0][j], distributed: j === 1 ? 5 : 0, central: 0 }));
+  const words = (...pressed) => Uint32Array.from(pressed.flatMap(([status, newtons]) => [status | newtons * 1000 << 16, 0]));
+  const draw = (cells, options) => arrows(it, axesOf(it), all, { cells, joints }, { dark: true, most: 10, late: new Set(), torque: null, force: false, alarm: [1, 0, 0], ...options });
+  const one = draw(words([2, 0], [2, 5], [4, 5]), { force: true });
+  assert.ok(one.length > 0, "of the second: the first is at rest, and the third is silent");
+  assert.equal(draw(words([2, 5], [2, 5], [4, 5]), { force: true }).length, 2 * one.length);
+  assert.equal(draw(words([2, 0], [2, 0], [2, 0]), { force: true }).length, 0);
+  const whole = draw(words([2, 0], [2, 0], [2, 0]), { torque: [0, 0, 1] }), broken = draw(words([2, 0], [2, 0], [2, 0]), { torque: [0, 0, 1], late: new Set([1]) });
+  assert.ok(whole.length > 0 && broken.length < 0.8 * whole.length, "one joint, with gaps");
+  assert.ok(broken[3] > 0 && broken[5] === 0 && whole[3] === 0 && whole[5] > 0, "in the colour of what is bad");
+  assert.deepEqual([0.3, 1, 1.2, 4.2, 73].map(roundUp).map((v) => Number(v.toPrecision(2))), [0.5, 1, 2, 5, 100]);
+});
+
+test("totals that grow are bad for a while, and a seek forgets when", () => {
+  const health = new Health(), at = (time, total) => { health.begin(time); return health.count("lost", total); };
+  assert.deepEqual([at(1, 5), at(2, 5), at(3, 7)], [0, 0, 2]);
+  assert.deepEqual([health.last("lost"), health.isPresent("lost")], [3, true]);
+  at(8, 7);
+  assert.deepEqual([health.last("lost"), health.isPresent("lost")], [3, false]);
+  at(2, 7);
+  assert.equal(health.last("lost"), null);
+});
+
+test("the ground fades into the background, with the axes of the base", () => {
+  const back = [0, 0, 0], all = ground(1, -0.2, back, [1, 1, 1]);
+  assert.equal(spacing(1), 0.1);
+  assert.ok(all.length % 12 === 0 && all.every(Number.isFinite));
+  const far = [];
+  for (let i = 0; i < all.length; i += 6) { assert.ok(Math.abs(all[i + 2] + 0.2) < 1e-6); if (Math.hypot(all[i], all[i + 1]) >= 1.4) far.push(...all.slice(i + 3, i + 6)); }
+  assert.ok(far.length && far.every((v) => v === 0));
+  assert.deepEqual(axesSeen([[1, 0, 0], [0, 0, 1], [0, -1, 0]]).map(({ name }) => name)[0], "y", "the farthest first");
 });
 
 test("numbers are short", () => {
@@ -262,6 +356,8 @@ test("buses have colours of their own, and cells at rest none", () => {
   assert.deepEqual(busColour(BUSES.length), BUSES[0]);
   assert.equal(colourOf(SHOWS.force, { force: 0 }, { bus: 1 }), null);
   assert.deepEqual(colourOf(SHOWS.force, { force: 10000 }, { bus: 1 }), ramp(1));
+  assert.deepEqual(colourOf(SHOWS.force, { force: 10000 }, { bus: 1 }, false), ramp(1, false));
+  assert.equal(colourOf(SHOWS.force, { force: 10000, status: 4 }, { bus: 1 }), null, "what a silent cell said is old");
 });
 
 test("a halt is told with its reason and the next step", () => {
