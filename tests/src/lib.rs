@@ -18,6 +18,7 @@ mod agenda;
 #[cfg(test)]
 mod architecture;
 pub mod bench;
+pub mod bus_time;
 pub mod can_raw;
 pub mod cell_slot;
 #[cfg(test)]

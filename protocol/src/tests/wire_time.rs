@@ -12,6 +12,12 @@ use proptest::prelude::*;
 /// Frames and their numbers of bits, counted by another program.
 const VECTORS: &str = include_str!("../../tests/vectors/can_frame_bits.csv");
 
+/// Counts the bits of a frame with the second implementation.
+fn counted_bits(frame: &Frame) -> FrameBits {
+    let [head, data, tail] = oracle::bits(frame);
+    FrameBits { nominal: head + tail, data }
+}
+
 fn frame(format: &str, id: u32, data: &[u8]) -> Frame {
     match format {
         "classic" => Frame::classic(id, data).unwrap(),
@@ -32,7 +38,7 @@ fn every_counted_frame_has_its_bits() {
         let frame = frame(format, u32::from_str_radix(id, 16).unwrap() | flag, &data);
         let expected = FrameBits { nominal: nominal.parse().unwrap(), data: switched.parse().unwrap() };
         assert_eq!(FrameBits::from_frame(&frame), Some(expected), "{line}");
-        assert_eq!(oracle::bits(&frame), expected, "{line}");
+        assert_eq!(counted_bits(&frame), expected, "{line}");
         count += 1;
     }
     assert_eq!(count, 200);
@@ -111,7 +117,7 @@ proptest! {
 
     #[test]
     fn bits_are_those_of_a_second_implementation(frame in any_frame()) {
-        prop_assert_eq!(FrameBits::from_frame(&frame), Some(oracle::bits(&frame)));
+        prop_assert_eq!(FrameBits::from_frame(&frame), Some(counted_bits(&frame)));
     }
 
     #[test]

@@ -17,3 +17,4 @@ mod bench_sensing;
 mod bench_sound;
 mod bench_sums;
 mod bench_touches;
+mod bus_time;

@@ -1,7 +1,7 @@
-//! A second implementation of the bit count that writes a frame bit by bit.
+//! A second implementation of the bit count that writes a frame bit by bit. The second program of `tests/src/bus_time`
+//! includes this file, too: the module around it imports what it uses.
 
-use crate::can::{BIT_RATE_SWITCH, ERROR_STATE, Format, Frame};
-use crate::wire_time::FrameBits;
+use super::{BIT_RATE_SWITCH, ERROR_STATE, Format, Frame};
 
 /// Appends the `count` lowest bits of a word, the most significant first.
 fn push(to: &mut Vec<bool>, word: u32, count: u32) {
@@ -31,8 +31,9 @@ fn stuff_bits(bits: &[bool]) -> Vec<usize> {
     places
 }
 
-/// Counts the bits of a frame, including stuff bits and the intermission.
-pub(crate) fn bits(frame: &Frame) -> FrameBits {
+/// Counts the bits of a frame, including stuff bits and the intermission: those before the bit rate switch, those at the
+/// data bit rate, and those after it. A frame without bit rate switch has all its bits before it.
+pub(crate) fn bits(frame: &Frame) -> [u32; 3] {
     let mut plain = Vec::new();
     let (fd, id) = (frame.format() == Format::Fd, frame.id());
     let remote = u32::from(frame.is_remote());
@@ -65,12 +66,8 @@ pub(crate) fn bits(frame: &Frame) -> FrameBits {
         // Stuff bit count, CRC, fixed stuff bits, delimiter.
         let check = if lengths[dlc] > 16 { 4 + 21 + 7 + 1 } else { 4 + 17 + 6 + 1 };
         // ACK, delimiter, end of frame, intermission.
-        let (nominal, data) = (head + early + 1 + 1 + 7 + 3, plain.len() - head + late + check);
-        return if switched {
-            FrameBits { nominal: count(nominal), data: count(data) }
-        } else {
-            FrameBits { nominal: count(nominal + data), data: 0 }
-        };
+        let [head, data, tail] = [head + early, plain.len() - head + late + check, 1 + 1 + 7 + 3].map(count);
+        return if switched { [head, data, tail] } else { [head + data + tail, 0, 0] };
     }
     push(&mut plain, remote, 1);
     push(&mut plain, 0, 2);
@@ -82,5 +79,5 @@ pub(crate) fn bits(frame: &Frame) -> FrameBits {
     push(&mut plain, crc, 15);
     // Delimiter, ACK, delimiter, end of frame, intermission.
     let bits = plain.len() + stuff_bits(&plain).len() + 1 + 1 + 1 + 7 + 3;
-    FrameBits { nominal: count(bits), data: 0 }
+    [count(bits), 0, 0]
 }
