@@ -1,6 +1,7 @@
 //! Models one bus: sorts the frames by time, simulates their transmission, and computes the figures of the bus.
 
 use std::collections::VecDeque;
+use std::num::NonZeroU32;
 
 use protocol::can::{Format, Frame};
 use protocol::packet::Epoch;
@@ -14,11 +15,12 @@ use super::{MAX_WAITING_FRAMES, REORDER_WINDOW_NS, SATURATED_NS};
 use crate::fit;
 use crate::fit::verdict::{AnsweringCells, FitSummary};
 use bus_model::traffic::{ClassifiedFrame, RunEvent, TrafficClassifier};
-use bus_model::{Attempt, BitErrors, BusModel, Priority, Request};
+use bus_model::{BitErrors, NodeBus, QueueOrder, Transmission, TransmitQueue};
 
-/// Maximum number of frames that wait to be sent on a bus: some minutes of a bus at full load. Further frames are
-/// refused, as a full transmit queue would.
-pub const MAX_QUEUED_FRAMES: usize = 1 << 22;
+/// The transmit queue of all senders on a bus: some minutes of a bus at full load. Every frame takes part in
+/// arbitration.
+const TRANSMIT_QUEUE: TransmitQueue =
+    TransmitQueue { order: QueueOrder::Priority, depth: NonZeroU32::new(1 << 22).expect("a depth above 0") };
 /// The number of identifiers of 11 bits.
 const IDENTIFIER_COUNT: usize = 0x800;
 
@@ -38,7 +40,7 @@ struct FrameTag {
 #[derive(Clone, Copy, Debug)]
 struct PendingFrame {
     at: u64,
-    priority: Priority,
+    frame: Frame,
     bits: FrameBits,
     place: u64,
     /// Identifier of the frame; `None` for one of 29 bits.
@@ -64,7 +66,7 @@ pub(super) struct BusTiming {
     pub(super) name: String,
     pub(super) counts: FrameCounts,
     known: BusProperties,
-    model: BusModel<FrameTag>,
+    model: NodeBus<FrameTag>,
     pending: VecDeque<PendingFrame>,
     frames: u64,
     /// Earliest and latest time of a frame in the capture, in ns.
@@ -83,12 +85,11 @@ pub(super) struct BusTiming {
 
 impl BusTiming {
     pub(super) fn new(name: &str, known: BusProperties, errors: Option<BitErrors>) -> Self {
-        let model = BusModel::new(known.rates);
         Self {
             name: name.to_owned(),
             counts: FrameCounts { bench_omitted: !known.bench_traffic, ..FrameCounts::default() },
+            model: NodeBus::new(known.rates, TRANSMIT_QUEUE, errors),
             known,
-            model: errors.into_iter().fold(model, BusModel::with_errors),
             pending: VecDeque::new(),
             frames: 0,
             span: None,
@@ -137,8 +138,7 @@ impl BusTiming {
             first.into_iter().for_each(|first| first.sorted.bench = sorted.bench);
         }
         self.phases.beginning.record_event(nanos, sorted.says);
-        let pending =
-            PendingFrame { at: nanos, priority: Priority::from_frame(frame), bits, place, id, sorted };
+        let pending = PendingFrame { at: nanos, frame: *frame, bits, place, id, sorted };
         match self.pending.back() {
             Some(last) if last.at > nanos => {
                 self.counts.out_of_order += 1;
@@ -174,7 +174,7 @@ impl BusTiming {
 
     /// Passes the next frame in order of time to the model, which requests its transmission.
     fn request_frame(&mut self, pending: PendingFrame, mut reported: Option<&mut FrameTimings>) {
-        let PendingFrame { at, priority, bits, place, id, sorted } = pending;
+        let PendingFrame { at, frame, bits, place, id, sorted } = pending;
         let ClassifiedFrame { says, bench, from, .. } = sorted;
         if let Some(bench) = bench {
             self.counts.bench.count_frames(bench, 1);
@@ -186,14 +186,15 @@ impl BusTiming {
         self.counts.too_late_to_sort += u64::from(at < self.released);
         let at = at.max(self.released);
         self.released = at;
-        self.model.run_until(at);
+        self.model.advance(at);
         self.collect_sent_frames(reported.as_deref_mut());
         let phase = self.phases.phase_at(at, says, self.traffic.is_skin_traffic());
         let answer = self.epochs.record_event(at, says, from);
         let took = bits.nanoseconds(self.model.rates());
         let figures = self.figures.get_mut(phase);
         figures.record_request(at, took);
-        if self.model.waiting() >= MAX_QUEUED_FRAMES {
+        let tag = FrameTag { place, id, phase, answer };
+        if self.model.request(at, 0, &frame, tag).is_err() {
             self.counts.no_room += 1;
             reported.into_iter().for_each(|reported| reported.record_sent(place, None));
             return;
@@ -203,15 +204,15 @@ impl BusTiming {
             *queued += 1;
             (*queued, id)
         });
-        let tag = FrameTag { place, id, phase, answer };
-        self.model.request(Request { at, priority, bits, queue: None, tag });
         figures.record_queue(at, self.model.waiting(), of_one);
     }
 
     /// Takes completed transmissions from the model and records them.
     fn collect_sent_frames(&mut self, mut reported: Option<&mut FrameTimings>) {
-        while let Some(attempt) = self.model.poll() {
-            let Attempt { tag: FrameTag { place, id, phase, answer }, at, start, end, is_damaged } = attempt;
+        while let Some(sent) = self.model.poll() {
+            let Transmission {
+                tag: FrameTag { place, id, phase, answer }, at, start, end, is_damaged, ..
+            } = sent;
             self.wire_end = end;
             self.figures.get_mut(self.phases.current_phase()).busy.record_transmission(
                 start,

@@ -2,13 +2,13 @@
 //! and the loads and delays that result.
 //!
 //! ```text
-//!   capture or live bus ──> receive ──> [ window ] ──> [ BusModel ] ──┬──> poll: FrameTiming, in the order of the frames
+//!   capture or live bus ──> receive ──> [ window ] ──> [ NodeBus ]  ──┬──> poll: FrameTiming, in the order of the frames
 //!                           for each bus:  sorts,      arbitrates     └──> report: load, delays, late replies, queues
 //! ```
 //!
 //! A frame's time stamp is taken as the time of its sender's request, which is correct on a bus without bit rate (vcan,
 //! the embedded bus). Each sender has a transmit buffer for each of its identifiers. Memory is bounded: frames out of
-//! order are sorted within [`REORDER_WINDOW_NS`] and [`MAX_WAITING_FRAMES`], and at most [`MAX_QUEUED_FRAMES`] frames
+//! order are sorted within [`REORDER_WINDOW_NS`] and [`MAX_WAITING_FRAMES`], and at most 4 194 304 frames
 //! wait on a bus.
 
 mod bus_timing;
@@ -32,7 +32,6 @@ use bus_model::{BitErrors, BitErrorsError};
 use bus_timing::{BusProperties, BusTiming};
 use reported::FrameTimings;
 
-pub use bus_timing::MAX_QUEUED_FRAMES;
 pub use phase::OPERATION_PAUSE_NS;
 pub use report::{
     AnsweringCounts, BusShadow, BusyStretches, DelayQuantiles, FrameCounts, KindDelays, Loads, Peak,
