@@ -2,6 +2,7 @@
 
 use analysis::fit::case::{AnswerPlan, BusCase};
 use analysis::fit::limits::{Limit, MAX_NODES_PER_BUS, NeededBuses};
+use analysis::fit::starving::StarvingFrames;
 use analysis::fit::verdict::{FitSummary, format_percent};
 use analysis::fit::{AssessedBus, BusFit, RatesRow, SkinFit, SpreadFit, rates_name};
 use protocol::parameters::Sensing;
@@ -88,7 +89,7 @@ pub(super) fn format_bus_fits(skin: &Skin, buses: &[BusFit], whole: Option<&Skin
 }
 
 fn add_bus_section(rows: &mut KeyValueTable, bus: &BusFit) {
-    let BusFit { name: bus_name, rated, most, need, answers, hints } = bus;
+    let BusFit { name: bus_name, rated, starving, most, need, answers, hints } = bus;
     let AssessedBus { case, load, times, .. } = rated;
     let cells = case.answers.cells();
     let worst = FitSummary::worst_case(rated);
@@ -115,6 +116,10 @@ fn add_bus_section(rows: &mut KeyValueTable, bus: &BusFit) {
     let heartbeat =
         or_else_text(times.heartbeat_ns.map(|ns| format!("{} ms", format_millis(ns))), "no upper bound");
     rows.add_row("heartbeats delayed by", heartbeat, "a cell silent for 600 ms counts as dead");
+    for (index, frames) in starving.iter().enumerate() {
+        let (which, from) = format_starving(frames, cells);
+        rows.add_row(if index == 0 { "no bound for" } else { "" }, which, from);
+    }
     let others = format!("bandwidth {}, deadline {}, nodes {}", most.bandwidth, most.deadline, most.nodes);
     rows.add_row("cells that fit", most.max_cells_in_time().min(most.nodes), others);
     rows.add_row("buses needed", format_needed_buses(need), format_each_need(need));
@@ -138,6 +143,17 @@ fn add_bus_section(rows: &mut KeyValueTable, bus: &BusFit) {
     }
     if !answers.iter().any(|it| is_roots_only(&it.after.case)) {
         rows.add_row("  sums", "not possible", "a cell has no route to the gateway");
+    }
+}
+
+/// Formats the frames of one kind that have no bound, and the node id from which on.
+fn format_starving(starving: &StarvingFrames, all_cells: u32) -> (String, String) {
+    let name = starving.frames.name();
+    match (starving.cells, starving.from_node) {
+        (Some(cells), Some(node)) if cells < all_cells => {
+            (format!("{name} of {}", count_with_noun(cells, "cell")), format!("node {node} and above"))
+        }
+        _ => (format!("all {name}"), String::new()),
     }
 }
 

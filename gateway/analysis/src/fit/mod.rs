@@ -18,6 +18,7 @@ mod json;
 pub mod limits;
 pub mod rates;
 pub mod response;
+pub mod starving;
 pub mod verdict;
 
 use protocol::can::Format;
@@ -30,6 +31,7 @@ pub use json::fit_json;
 use case::{BusCase, BusLoad, WorstCaseTimes};
 use hint::Hint;
 use limits::{Limit, MaxCells, NeededBuses, exceeded_limits};
+use starving::{StarvingFrames, starving_frames};
 use verdict::FitVerdict;
 
 /// Computation time of the paper's cell, 68.5 µs: 1096 instructions at 16 MIPS.
@@ -103,6 +105,9 @@ pub struct BusFit {
     /// Load, times and limits of the bus as described.
     #[serde(flatten)]
     pub rated: AssessedBus,
+    /// The frames that have no bound, highest priority first.
+    #[serde(rename = "without_bound")]
+    pub starving: Vec<StarvingFrames>,
     /// The maximum number of cells on the bus, by each limit.
     #[serde(rename = "most_cells")]
     pub most: MaxCells,
@@ -129,9 +134,12 @@ pub fn assess_bus(
     let name = skin.buses.get(index)?.name.clone();
     let case = BusCase::from_skin(skin, index, format, rates, computation_ns)?;
     let most = MaxCells::for_case(&case);
+    let mut nodes: Vec<_> = skin.cells_on_bus(index).map(|cell| cell.node.get()).collect();
+    nodes.sort_unstable();
     Some(BusFit {
         name,
         rated: AssessedBus::assess(&case),
+        starving: starving_frames(&case, &nodes),
         most,
         need: NeededBuses::for_cells(&most, case.answers.cells()),
         answers: hint::hints_for_other_answers(skin, index, &case),

@@ -1,6 +1,7 @@
 //! Tests results for skins against known values, and every hint against the resulting skin.
 
 mod simulated;
+mod starving;
 
 use protocol::can::Format;
 use protocol::skin::Skin;
