@@ -82,7 +82,8 @@ pub(crate) struct FitCommand {
     ///
     /// Keys of a frame: time, start_s, end_s (s on the clock of the capture), bus, id (as candump prints it),
     /// nominal_bits and data_bits (including stuff bits and intermission). Frames left out have null bits and null
-    /// times; frames that were never sent have null times.
+    /// times; frames that were never sent have null times. time_is is "end" if time is the end of the frame on a timed
+    /// bus, else missing.
     #[arg(long, short)]
     json: bool,
     #[command(flatten)]

@@ -50,8 +50,9 @@ impl FitCommand {
         let (mut shadow, taken) = if self.are_captures(&name)? {
             let reader = open_capture(&self.sources, |file| Box::new(file))?;
             reader.name().clone_into(&mut title);
-            let mut shadow =
-                self.create_shadow(skin.or_else(|| skin_found_so_far(&reader, "name one with --skin")))?;
+            let skin = skin.or_else(|| skin_found_so_far(&reader, "name one with --skin"));
+            let timed_buses = reader.extras().timed_buses().map(str::to_owned).collect();
+            let mut shadow = self.create_shadow(skin, timed_buses)?;
             for before in &reader.extras().latched {
                 shadow.receive_latched(&before.bus, before.nanos, &before.frame);
             }
@@ -60,7 +61,7 @@ impl FitCommand {
             (shadow, taken)
         } else {
             let stopped = stop_flag()?;
-            let mut shadow = self.create_shadow(skin)?;
+            let mut shadow = self.create_shadow(skin, Vec::new())?;
             let taken = self.receive_live_traffic(&mut shadow, &mut out, &stopped)?;
             (shadow, taken)
         };
@@ -108,7 +109,7 @@ impl FitCommand {
 
     /// Creates the model of the buses with the bit rates of the command line, or else those of the skin, or else common
     /// ones.
-    fn create_shadow(&self, skin: Option<Skin>) -> Result<Shadow, Failure> {
+    fn create_shadow(&self, skin: Option<Skin>, timed_buses: Vec<String>) -> Result<Shadow, Failure> {
         let requested = RequestedRates { nominal: self.nominal, data: self.data };
         let mut of_bus = self.rates.clone();
         for bus in skin.iter().flat_map(|skin| &skin.buses) {
@@ -123,6 +124,7 @@ impl FitCommand {
             seed: self.seed.unwrap_or(1),
             each_frame: self.json,
             bench_traffic: self.bench_traffic,
+            timed_buses,
             skin,
             ..shadow::ShadowOptions::new(requested.rates().map_err(Failure::usage_error)?)
         };

@@ -58,6 +58,8 @@ pub(super) struct BusProperties {
     pub(super) worst_case: Option<FitSummary>,
     /// True to include frames that only a bench sends.
     pub(super) bench_traffic: bool,
+    /// True if time stamps are the ends of frames.
+    pub(super) is_timed: bool,
 }
 
 /// The model and the figures of one bus.
@@ -111,6 +113,11 @@ impl BusTiming {
             says @ (RunEvent::Halt | RunEvent::Resume) => _ = self.epochs.record_event(nanos, says, None),
             RunEvent::Answer(_) | RunEvent::Preparation | RunEvent::Other => {}
         }
+    }
+
+    /// Returns true if time stamps are the ends of frames.
+    pub(super) const fn is_timed(&self) -> bool {
+        self.known.is_timed
     }
 
     /// Counts a frame of any kind and its time.
@@ -191,6 +198,13 @@ impl BusTiming {
         let phase = self.phases.phase_at(at, says, self.traffic.is_skin_traffic());
         let answer = self.epochs.record_event(at, says, from);
         let took = bits.nanoseconds(self.model.rates());
+        if self.known.is_timed {
+            self.record_ended(at, took, phase, answer);
+            reported
+                .into_iter()
+                .for_each(|reported| reported.record_sent(place, Some((at - took.min(at), at))));
+            return;
+        }
         let figures = self.figures.get_mut(phase);
         figures.record_request(at, took);
         let tag = FrameTag { place, id, phase, answer };
@@ -205,6 +219,21 @@ impl BusTiming {
             (*queued, id)
         });
         figures.record_queue(at, self.model.waiting(), of_one);
+    }
+
+    /// Records a frame of a timed bus, which ended `at` and took `took` ns.
+    fn record_ended(&mut self, at: u64, took: u64, phase: BusPhase, answer: Option<(Epoch, bool)>) {
+        // With bit rates below the real ones, frames would overlap.
+        let start = at.saturating_sub(took).max(self.wire_end);
+        self.wire_end = at;
+        let figures = self.figures.get_mut(phase);
+        figures.record_request(start, took);
+        figures.busy.record_transmission(start, at, SATURATED_NS);
+        self.counts.sent += 1;
+        if let Some((epoch, _)) = answer {
+            // The time at which the answer was ready is unknown: it counts as early.
+            self.epochs.record_answer(epoch, false, (0, at));
+        }
     }
 
     /// Takes completed transmissions from the model and records them.
@@ -287,6 +316,7 @@ impl BusTiming {
             bus: self.name.clone(),
             name: self.rates_text(),
             rates: self.known.rates,
+            is_timed: self.known.is_timed,
             frames: self.frames,
             first_ns: first,
             zero_ns: first,

@@ -7,7 +7,7 @@
 //! ```
 //!
 //! A frame's time stamp is taken as the time of its sender's request, which is correct on a bus without bit rate (vcan,
-//! the embedded bus). Each sender has a transmit buffer for each of its identifiers. Memory is bounded: frames out of
+//! the embedded bus); on a timed bus it is the end of the frame. Each sender has a transmit buffer for each of its identifiers. Memory is bounded: frames out of
 //! order are sorted within [`REORDER_WINDOW_NS`] and [`MAX_WAITING_FRAMES`], and at most 4 194 304 frames
 //! wait on a bus.
 
@@ -63,6 +63,8 @@ pub struct ShadowOptions {
     pub each_frame: bool,
     /// True to include frames that only a bench sends.
     pub bench_traffic: bool,
+    /// The names of buses whose time stamps are the ends of frames on a timed bus. No queueing is modelled for them.
+    pub timed_buses: Vec<String>,
     /// The skin, from which the worst case is computed for comparison with the capture.
     pub skin: Option<Skin>,
 }
@@ -78,6 +80,7 @@ impl ShadowOptions {
             seed: 1,
             each_frame: false,
             bench_traffic: false,
+            timed_buses: Vec::new(),
             skin: None,
         }
     }
@@ -90,7 +93,8 @@ impl ShadowOptions {
             described.map(|(skin, bus)| u32::try_from(skin.cells_on_bus(bus).count()).unwrap_or(u32::MAX));
         let worst_case = described.and_then(|(skin, bus)| fit::assess_worst_case(skin, bus, rates));
         let worst_case = worst_case.as_ref().map(FitSummary::worst_case);
-        BusProperties { rates, cells, worst_case, bench_traffic: self.bench_traffic }
+        let is_timed = self.timed_buses.iter().any(|name| name == bus);
+        BusProperties { rates, cells, worst_case, bench_traffic: self.bench_traffic, is_timed }
     }
 }
 
@@ -178,6 +182,12 @@ impl Shadow {
     #[must_use]
     pub fn bus(&self, bus: usize) -> &str {
         self.bus_timings.get(bus).map_or("", |bus_timing| &bus_timing.name)
+    }
+
+    /// Returns true if the time stamps of a bus, given as in [`FrameTiming::bus`], are the ends of its frames.
+    #[must_use]
+    pub fn is_timed(&self, bus: usize) -> bool {
+        self.bus_timings.get(bus).is_some_and(BusTiming::is_timed)
     }
 
     /// Returns the figures of all buses.

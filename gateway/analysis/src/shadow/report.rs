@@ -32,6 +32,8 @@ pub struct BusShadow {
     /// Bit rates of the bus.
     #[serde(serialize_with = "as_text")]
     pub rates: BitRates,
+    /// True if the time stamps are the ends of frames on a timed bus, so that no delays and queues are known.
+    pub is_timed: bool,
     /// Frames of any kind.
     pub frames: u64,
     /// The time of the first frame, in ns of the capture's clock.

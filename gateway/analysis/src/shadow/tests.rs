@@ -218,3 +218,40 @@ fn nothing_is_nothing() {
     let (_, report) = ended(shadow);
     assert_eq!((report.buses[0].counts.missing, report.buses[0].load.mean), (7, None));
 }
+
+#[test]
+fn time_stamps_of_a_timed_bus_are_the_ends_of_its_frames() {
+    let mut timed =
+        Shadow::new(ShadowOptions { timed_buses: vec!["vcan0".to_owned()], ..options() }).unwrap();
+    for epoch in 0..40 {
+        let at = u64::from(epoch) * 16 * MS + MS;
+        let mut send = |mut end: u64, messages: &[Message]| {
+            for frame in
+                messages.iter().flat_map(|it| it.encode().frames(Format::Classic).collect::<Vec<_>>())
+            {
+                end += took(&frame);
+                timed.receive("vcan0", end, &frame);
+            }
+        };
+        send(at, &[joints(epoch)]);
+        // The answer of the last cell follows the next joints.
+        let late = (epoch > 0).then(|| torque(21, epoch - 1));
+        let answers: Vec<_> = late.into_iter().chain((1..=20).map(|cell| torque(cell, epoch))).collect();
+        send(at + MS, &answers);
+    }
+    let (frames_of_timed, report) = ended(timed);
+    let bus = &report.buses[0];
+    assert!(bus.is_timed);
+    for frame in &frames_of_timed {
+        let took = frame.bits.unwrap().nanoseconds(options().rates);
+        assert_eq!(frame.sent, Some((frame.nanos - took, frame.nanos)));
+    }
+    assert_eq!(bus.counts.sent, u64::try_from(frames_of_timed.len()).unwrap());
+    assert_eq!((bus.delay_us.count, bus.queue.value.to_bits(), bus.kinds.len()), (0, 0, 0));
+    let replies = bus.replies.as_ref().unwrap();
+    assert_eq!((replies.count, replies.late, replies.late_before, replies.late_when_ready), (839, 39, 0, 0));
+    let busy: u64 = frames_of_timed.iter().map(|it| it.bits.unwrap().nanoseconds(options().rates)).sum();
+    let span = frames_of_timed.last().unwrap().nanos - frames_of_timed[0].nanos;
+    let share = bus.load.busy.unwrap();
+    assert!((share - busy as f64 / span as f64).abs() < 1e-2, "{share} of {}", busy as f64 / span as f64);
+}

@@ -18,13 +18,14 @@ pub(super) fn write_frames(shadow: &mut Shadow, out: &mut impl Write) -> io::Res
     let mut line = Vec::with_capacity(192);
     while let Some(frame) = shadow.poll() {
         line.clear();
-        write_frame(&mut line, frame.bus.map(|bus| shadow.bus(bus)), &frame)?;
+        let is_timed = frame.bus.is_some_and(|bus| shadow.is_timed(bus));
+        write_frame(&mut line, frame.bus.map(|bus| shadow.bus(bus)), &frame, is_timed)?;
         out.write_all(&line)?;
     }
     Ok(())
 }
 
-fn write_frame(line: &mut Vec<u8>, bus: Option<&str>, frame: &FrameTiming) -> io::Result<()> {
+fn write_frame(line: &mut Vec<u8>, bus: Option<&str>, frame: &FrameTiming, is_timed: bool) -> io::Result<()> {
     let FrameTiming { nanos, id, extended, bits, sent, .. } = *frame;
     line.extend_from_slice(b"{\"time\":");
     append_seconds(line, Some(nanos));
@@ -38,6 +39,9 @@ fn write_frame(line: &mut Vec<u8>, bus: Option<&str>, frame: &FrameTiming) -> io
     for (key, nanos) in [("start", sent.map(|(start, _)| start)), ("end", sent.map(|(_, end)| end))] {
         write!(line, ",\"{key}_s\":")?;
         append_seconds(line, nanos);
+    }
+    if is_timed {
+        line.extend_from_slice(b",\"time_is\":\"end\"");
     }
     line.extend_from_slice(b"}\n");
     Ok(())
@@ -81,6 +85,9 @@ fn bus_rows(rows: &mut KeyValueTable, bus: &BusShadow, report: &ShadowReport) {
         String::new()
     };
     rows.add_section(format!("{} at {}", bus.bus, bus.name), count, missing);
+    if bus.is_timed {
+        rows.add_row("time stamps", "ends of frames", "of a timed bus: no queueing is computed");
+    }
     add_fit_rows(rows, bus, report.has_times);
     if bus.this_run.is_some() {
         add_operation_rows(rows, bus);
@@ -145,15 +152,27 @@ fn add_operation_rows(rows: &mut KeyValueTable, bus: &BusShadow) {
     add_load_rows(rows, bus, &bus.load, ("average load", &format!("{:.3} s in operation", bus.operation_s)));
     rows.add_row("  bus busy", format_share(bus.load.busy), "");
     add_busy_stretch_row(rows, bus, &bus.stretches);
+    if !bus.is_timed {
+        add_delay_rows(rows, bus);
+    }
+    if let Some(replies) = &bus.replies {
+        add_answer_rows(rows, replies);
+    }
+    if !bus.is_timed {
+        add_queue_rows(rows, bus);
+    }
+}
+
+fn add_delay_rows(rows: &mut KeyValueTable, bus: &BusShadow) {
     rows.add_row("delay, µs", "50 % / 99 % / max", "from queueing to end of frame");
     rows.add_row("  all frames", format_delays(&bus.delay_us), format!("{} frames", bus.delay_us.count));
     for kind in &bus.kinds {
         let (name, delay) = (kind.kind, &kind.delay_us);
         rows.add_row(format!("  {name}"), format_delays(delay), format!("{} frames", delay.count));
     }
-    if let Some(replies) = &bus.replies {
-        add_answer_rows(rows, replies);
-    }
+}
+
+fn add_queue_rows(rows: &mut KeyValueTable, bus: &BusShadow) {
     rows.add_row("longest queue", format!("{} frames", bus.queue.value), format_peak_time(bus, bus.queue));
     if bus.queue_of_one.value > 0.0 {
         let of = format!("{} frames of {}", bus.queue_of_one.value, Identifier(bus.queue_of_one_id, false));
@@ -166,7 +185,9 @@ fn add_start_up_rows(rows: &mut KeyValueTable, bus: &BusShadow, start_up: &Start
     let beside = format!("{} frames, {:.3} s before joints", start_up.frames, start_up.duration_s);
     add_load_rows(rows, bus, &start_up.load, ("start-up: average load", &beside));
     add_busy_stretch_row(rows, bus, &start_up.stretches);
-    rows.add_row("  delay, µs", format_delays(&start_up.delay_us), "50 % / 99 % / max");
+    if !bus.is_timed {
+        rows.add_row("  delay, µs", format_delays(&start_up.delay_us), "50 % / 99 % / max");
+    }
 }
 
 fn add_bench_traffic_row(rows: &mut KeyValueTable, bus: &BusShadow) {

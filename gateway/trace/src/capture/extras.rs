@@ -48,6 +48,13 @@ pub const fn seconds_since(zero: u64, nanos: u64) -> f64 {
     if nanos < zero { (zero - nanos) as f64 / -1e9 } else { (nanos - zero) as f64 / 1e9 }
 }
 
+/// The name of the metadata record that holds the properties of a run and of its buses.
+const CONFIGURATION_METADATA: &str = "configuration";
+/// Prefix of the key in [`CONFIGURATION_METADATA`] that states the time of a bus; the name of the bus follows.
+const BUS_TIME_KEY_PREFIX: &str = "skinbus_bus_time/";
+/// The value of such a key if frames take the time of their bits on the bus.
+const REAL_BUS_TIME: &str = "real";
+
 /// The name of the attachment that holds the skin of a recorded run.
 pub const SKIN_ATTACHMENT: &str = "skin.toml";
 
@@ -80,6 +87,14 @@ impl RecordingExtras {
     #[must_use]
     pub fn sine_name(&self) -> Option<&str> {
         self.metadata_value(RUN_METADATA, SINE_KEY)
+    }
+
+    /// Returns the names of the buses on which frames took the time of their bits. The time stamps of their frames are
+    /// the ends of the frames.
+    pub fn timed_buses(&self) -> impl Iterator<Item = &str> {
+        let run = self.metadata.iter().filter(|(name, _)| name == CONFIGURATION_METADATA);
+        let timed = run.flat_map(|(_, facts)| facts).filter(|(_, value)| value == REAL_BUS_TIME);
+        timed.filter_map(|(key, _)| key.strip_prefix(BUS_TIME_KEY_PREFIX))
     }
 
     /// Returns the attached skin; `None` if the recording has none.
@@ -116,4 +131,23 @@ pub struct Topic {
     pub schema: String,
     /// The number of its messages.
     pub messages: u64,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn timed_buses_are_those_whose_time_is_real() {
+        let facts =
+            [("bus/can0", "real"), ("skinbus_bus_time/can0", "real"), ("skinbus_bus_time/can1", "no")];
+        let facts = facts.map(|(key, value)| (key.to_owned(), value.to_owned())).to_vec();
+        let of = |record: &str| {
+            let metadata = vec![(record.to_owned(), facts.clone())];
+            let extras = RecordingExtras { metadata, ..RecordingExtras::default() };
+            extras.timed_buses().map(str::to_owned).collect::<Vec<_>>()
+        };
+        assert_eq!(of("configuration"), ["can0"]);
+        assert_eq!(of("machine"), [""; 0]);
+    }
 }
