@@ -281,7 +281,7 @@ fn in_shell(place: &TestDir, before: &str, run: &str, after: &str) -> process::E
 
 /// Ends a bench in a shell some broadcasts after its recording broke off.
 fn until_it_broke_off(place: &TestDir, shell: process::Running) -> process::Ended {
-    shell.wait_for_stderr("the run continues without it");
+    shell.wait_for_stderr("the run continues without recording");
     place.test_client().waits_for_joints(20);
     // The shell's own command line contains the name as well.
     let is_it = |line: &str| line.split(' ').next().is_some_and(|program| program.ends_with("/skinbus"));
@@ -296,7 +296,7 @@ fn broke_off(place: &TestDir, ended: &process::Ended, why: &str) {
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     assert!(ended.stdout.contains("8 cells"), "the table is complete: {ended:#?}");
     let said: Vec<_> =
-        ended.stderr.lines().filter(|line| line.contains("the run continues without it")).collect();
+        ended.stderr.lines().filter(|line| line.contains("the run continues without recording")).collect();
     assert!(said.iter().all(|line| line.contains(why)), "{ended:#?}");
     assert!(said.first().is_some_and(|line| line.starts_with("run.mcap: ")), "{ended:#?}");
     assert!(

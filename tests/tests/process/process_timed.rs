@@ -1,6 +1,8 @@
 //! Embedded buses on which frames take time, with real servers, cells and clients.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
+use std::collections::BTreeSet;
+
 use bus_model::TransmitQueue;
 use protocol::bus::embedded::{ClientHello, HelloReply, seqpacket_socket, socket_address};
 use protocol::bus::{Bus, BusKind, BusOptions, Filter, Inbox, KindChoice};
@@ -8,7 +10,9 @@ use protocol::can::{BIT_RATE_SWITCH, Frame};
 use protocol::wire_time::{BitRates, FrameBits};
 use rustix::net::{RecvFlags, SendFlags, SocketFlags};
 use rustix::process::Signal;
+use skinbus_tests::bus_time::check_record;
 use skinbus_tests::process::{PRESSED, Running, TestDir, skin, until};
+use trace::capture::{CaptureEntry, Reader};
 
 const RATES: &str = "1M/5M";
 
@@ -99,6 +103,34 @@ fn frames_are_stamped_with_their_ends_and_refused_when_the_queue_is_full() {
     }
     assert!(!stamped.is_empty() && stamped.iter().all(|stamp| ends.contains(stamp)), "{stamped:?} {ends:?}");
     place.is_left_clean();
+}
+
+#[test]
+fn a_second_program_computes_the_times_of_a_live_bus_again() {
+    for options in ["--queue priority:8", "--queue fifo:8 --bit-errors 0.0001 --seed 3"] {
+        let place = TestDir::new();
+        place.skin(24);
+        place.scenario(PRESSED);
+        let server = serve(&place, &format!("--rates {RATES} --record record.txt {options}"));
+        place.bench(2.0, "--record run.mcap").end().succeeded();
+        place.summary().adds_up();
+        server.signal(Signal::TERM);
+        server.end().succeeded();
+        let figures = check_record(&place.read("record.txt"));
+        assert!(figures.sent.len() > 24 * 50 && figures.bench > 0, "{options}: {figures:?}");
+        // The recording has the ends of the frames as time stamps, and says so.
+        let ends: BTreeSet<_> = figures.sent.iter().map(|sent| sent.end).collect();
+        let mut recorded = Reader::open_all(&[place.path("run.mcap")]).unwrap();
+        let mut count = 0;
+        while let Some(entry) = recorded.next().unwrap() {
+            if let CaptureEntry::Frame(record) = entry {
+                count += usize::from(ends.contains(&record.time.nanos));
+            }
+        }
+        assert!(count > 24 * 50, "{options}: {count} of {} frames", figures.sent.len());
+        assert_eq!(recorded.extras().timed_buses().collect::<Vec<_>>(), ["vcan0"]);
+        place.is_left_clean();
+    }
 }
 
 #[test]

@@ -24,6 +24,8 @@ pub struct SharedBus {
     pub kind: BusKind,
     /// Size of the receive buffer in bytes that the kernel granted when the bus was first opened.
     pub receive_buffer: usize,
+    /// True if time stamps are ends of frames, because frames take time on the bus.
+    pub is_timed: bool,
     /// State of the bus that the control loop reads too.
     pub state: Arc<BusState>,
     /// Options with which the bus is opened, also when it is reopened.
@@ -54,6 +56,7 @@ impl SharedBus {
             name: bus.name().to_owned(),
             kind: bus.kind(),
             receive_buffer: bus.receive_buffer_bytes(),
+            is_timed: bus.is_timed(),
             state: Arc::default(),
             target,
             bus: Mutex::new(Arc::clone(&bus)),

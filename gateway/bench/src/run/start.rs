@@ -42,6 +42,7 @@ use control::motion::controller_for_motion;
 use control::robot::SimulatedArm;
 use model::quantiles::Quantiles;
 use model::table::BusTable;
+use trace::capture::bus_time_property;
 use trace::recording::layout::Layout;
 use trace::recording::series::FileHead;
 
@@ -284,6 +285,8 @@ fn recording_head(
         let how = format!("{}, {format}, receive buffer {} bytes", link.kind, link.receive_buffer);
         (format!("bus/{}", link.name), how)
     }));
+    let timed = bus_links.iter().filter(|bus_link| bus_link.link.is_timed);
+    run.extend(timed.map(|timed| bus_time_property(&timed.link.name)));
     let metadata = vec![
         ("program", facts::program_metadata(&mcap.command_line, nanos)),
         ("machine", facts::machine_metadata(&Quantiles::from_histogram(idle, 1e-3))),

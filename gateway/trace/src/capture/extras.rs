@@ -55,6 +55,12 @@ const BUS_TIME_KEY_PREFIX: &str = "skinbus_bus_time/";
 /// The value of such a key if frames take the time of their bits on the bus.
 const REAL_BUS_TIME: &str = "real";
 
+/// Returns the property that a recording has of a bus on which frames take the time of their bits.
+#[must_use]
+pub fn bus_time_property(bus: &str) -> (String, String) {
+    (format!("{BUS_TIME_KEY_PREFIX}{bus}"), REAL_BUS_TIME.to_owned())
+}
+
 /// The name of the attachment that holds the skin of a recorded run.
 pub const SKIN_ATTACHMENT: &str = "skin.toml";
 
@@ -142,6 +148,7 @@ mod tests {
         let facts =
             [("bus/can0", "real"), ("skinbus_bus_time/can0", "real"), ("skinbus_bus_time/can1", "no")];
         let facts = facts.map(|(key, value)| (key.to_owned(), value.to_owned())).to_vec();
+        assert_eq!(bus_time_property("can0"), facts[1]);
         let of = |record: &str| {
             let metadata = vec![(record.to_owned(), facts.clone())];
             let extras = RecordingExtras { metadata, ..RecordingExtras::default() };

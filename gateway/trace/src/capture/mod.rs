@@ -25,7 +25,8 @@ mod times;
 
 pub use error::CaptureError;
 pub use extras::{
-    LatchedFrame, RUN_METADATA, RecordingExtras, SKIN_ATTACHMENT, Topic, run_metadata, seconds_since,
+    LatchedFrame, RUN_METADATA, RecordingExtras, SKIN_ATTACHMENT, Topic, bus_time_property, run_metadata,
+    seconds_since,
 };
 pub use mcap::ORIGIN_METADATA;
 pub(crate) use mcap::is_foreign_frame;
