@@ -2,7 +2,7 @@
 //! `bus_model` and without the bit counts of `protocol::wire_time`, and compares the record of a server with them.
 //!
 //! ```text
-//!   requests ──> a list for each node ──> eligible frames, sorted by their arbitration bits ──> transmissions
+//!   requests ──> a list for each node ──> the lowest arbitration bits of all eligible frames ──> transmissions
 //!                                                                                                    ║ equal
 //!   record of a server ──> requests, damaged bits                                    transmissions ══╝
 //! ```
@@ -75,6 +75,9 @@ pub struct BusResult {
 
 /// Computes the transmissions of requests in order of time, until all are sent. For each transmission in its order,
 /// `damaged_bits` has the number of bits up to and including the first damaged one, or `None`.
+///
+/// # Panics
+/// If a request is for an error frame, or later than the next one.
 #[must_use]
 pub fn transmit(
     rates: BitRates,
@@ -104,9 +107,7 @@ pub fn transmit(
         };
         join(&mut lists, &|at| at <= free_at);
         let eligible = lists.values().flat_map(|list| queues.eligible(list));
-        let mut eligible: Vec<_> = eligible.map(|&it| (frames[it].arbitration_bits(), it)).collect();
-        eligible.sort_unstable();
-        let request = eligible[0].1;
+        let (_, request) = eligible.map(|&it| (frames[it].arbitration_bits(), it)).min().unwrap();
         let damaged_bit = damaged_bits.get(result.sent.len()).copied().flatten();
         let end = free_at + frames[request].nanoseconds(rates, damaged_bit);
         // Until its end, the frame has its place in the queue.

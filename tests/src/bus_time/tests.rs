@@ -26,7 +26,7 @@ S 1 214000 296000
 S 3 296000 335000
 Q 5 400000 2 0A0AB55D#D0A6
 S 5 400000 485000
-Q 6 500000 1 184#83E0F83E0F83E0F8
+Q 6 600000 1 184#83E0F83E0F83E0F8
 ";
 const FIFO_RECORD: &str = "\
 # skinbus timed bus 1 rates 1M/5M queue fifo:4 errors 0 seed 1
@@ -90,13 +90,13 @@ fn records_with_one_difference_are_refused() {
         ("B 5000 2", "B 5000 2 2", "line 6: "),
         ("17D#89", "17D#8", "line 3: \"17D#8CFE3B1\""),
         ("17D#89CFE3B1", "17D#00000000", "line 11: "),
-        ("X 3000 1", "Q 2 3000 1", "line 4: refused is false, expected true"),
+        ("X 3000 1", "Q 2 3000 1", "line 11: 0F1#77 of line 4 waited, and has priority"),
         ("X 3000 1", "X 3000 2", "line 4: refused is true, expected false"),
         ("S 0 1000 125000", "S 0 1001 125001", "line 9: it starts before 125001"),
         ("S 0 1000 125000", "S 0 900 124900", "line 7: it starts before 1000"),
         ("S 0 1000 125000", "S 0 1000 1000", "line 7: it ends before it starts"),
         ("S 0 1000 125000", "S 9 1000 125000", "line 7: 9 does not wait"),
-        ("S 0 1000 125000\n", "", "line 8: "),
+        ("S 0 1000 125000\n", "", "line 11: 184#83E0F83E0F83E0F8 of line 2 waited"),
         ("Q 4 125000", "Q 4 125001", "line 9: it starts before 125001"),
         ("D 4 125000 158000\n", "", "line 9: ends are 89000 ns apart, but a frame of 56000 ns waited"),
         ("D 4 125000 158000", "D 4 125000 158500", "line 10: it starts before 158500"),

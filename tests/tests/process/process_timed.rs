@@ -192,7 +192,11 @@ fn what_cannot_take_time_is_refused() {
     };
     refused("serve vcan0 --queue fifo", 2, "--rates");
     refused("serve vcan0 --rates 1M/5M --queue lifo", 2, "use fifo or priority");
-    refused("serve vcan0 --rates 1M/5M --bit-errors 0.5", 2, "bit error rate 0.5: use 0 to 0.01");
+    refused(
+        "serve vcan0 --rates 1M/5M --bit-errors 0.5",
+        2,
+        "the bit error rate 0.5 is out of range: use 0 to 0.01",
+    );
     refused("serve vcan0 --rates 9M", 2, "9M");
     place.write("record.txt", "mine");
     refused("serve vcan0 --rates 1M --record record.txt", 1, "cannot create record.txt");

@@ -197,7 +197,10 @@ fn pages_that_may_only_look_press_nothing() {
             "--token-file skin.toml: a token must consist of 16 to 256 letters or digits",
         ),
         ("--token-file no-such-file", "--token-file no-such-file: No such file or directory"),
-        ("--address-file skin.toml", "--address-file skin.toml: it exists and does not contain the address"),
+        (
+            "--address-file skin.toml",
+            "--address-file skin.toml: the file exists and does not contain the address of a page",
+        ),
         ("--listen nowhere", "--listen"),
         ("", "vcan0"),
     ] {

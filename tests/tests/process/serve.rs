@@ -350,7 +350,10 @@ fn what_was_ignored_is_said_at_the_end() {
     server.stderr.take().unwrap().read_to_string(&mut said).unwrap();
     let status = server.wait().unwrap();
     assert_eq!((status.code(), said.lines().count()), (Some(0), 1), "{said}");
-    assert!(said.contains("vcan0: ignored 1 datagrams") && said.contains("refused 0 clients"), "{said}");
+    assert!(
+        said.contains("vcan0: ignored 1 invalid datagrams") && said.contains("refused 0 clients"),
+        "{said}"
+    );
 }
 
 /// Starts a server with a limit of open files, given as an option of `ulimit`.

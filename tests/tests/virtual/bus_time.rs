@@ -143,9 +143,6 @@ fn compare(order: QueueOrder) -> usize {
         idle += gaps;
         back_to_back += result.sent.len() - 1 - gaps;
     }
-    println!(
-        "{order:?}: {frames} frames, {refused} refused, {damaged} damaged, {idle} after a pause, {back_to_back} not"
-    );
     assert!(refused > frames / 20 && refused < frames / 2, "{refused}");
     assert!(damaged > frames / 20 && idle > frames / 20 && back_to_back > frames / 4);
     frames
