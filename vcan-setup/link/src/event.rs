@@ -49,7 +49,10 @@ impl fmt::Display for LinkEvent {
                 write!(f, "two hosts have the name '{host}': give each its own name with --host")
             }
             Self::Lost { from_here, from_others } => {
-                write!(f, "the link lost {from_here} frames from this host and {from_others} from other hosts")
+                write!(
+                    f,
+                    "the link lost {from_here} frames from this host and {from_others} from other hosts"
+                )
             }
         }
     }

@@ -129,9 +129,9 @@ fn the_frames_without_a_bound_are_named_with_their_cells() {
     let expected = [all(FrameKind::Torques, 27, 227), all(FrameKind::Heartbeats, 253, 1)];
     assert_eq!(starving(&arm, "1M/5M"), expected);
     // 216 * 70.4 are 15 206 us; 176 of 215 heartbeats, each 0.064 frames a period, fill the rest.
-    let fewer = SkinRequest { cells: 215, ..arm.clone() };
+    let fewer = SkinRequest { cells: 215, ..arm };
     assert_eq!(starving(&fewer, "1M/5M"), [all(FrameKind::Heartbeats, 39, 177)]);
-    let sums = SkinRequest { reply: ReplyMode::Sum, ..arm.clone() };
+    let sums = SkinRequest { reply: ReplyMode::Sum, ..arm };
     assert_eq!(starving(&sums, "1M/5M")[0], all(FrameKind::Sums, 27, 227));
     assert_eq!(starving(&arm, "1M/8M"), []);
     let slow = StarvingFrames { frames: FrameKind::Joints, cells: None, from_node: None };
