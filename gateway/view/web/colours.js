@@ -1,5 +1,4 @@
 // Colours for values: viridis, whose order all readers can see, with any kind of colour vision (Smith, van der Walt 2015).
-// gateway/analysis/src/report/svg/colour.rs has the same.
 
 import { DEAD } from "./snapshot.js";
 
