@@ -286,12 +286,12 @@ mod tests {
     fn what_is_too_long_is_told_apart_from_what_fits() {
         let (a, b) =
             socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None).unwrap();
-        rustix::net::send(&a, &[1; 73], SendFlags::empty()).unwrap();
-        rustix::net::send(&a, &[2; 72], SendFlags::empty()).unwrap();
+        rustix::net::send(&a, &[1; 81], SendFlags::empty()).unwrap();
+        rustix::net::send(&a, &[2; 80], SendFlags::empty()).unwrap();
         let mut batch = ReceiveBatch::new();
         assert_eq!(batch.receive(&b).unwrap(), 2);
         let bytes: Vec<_> = batch.datagrams().map(Datagram::bytes).collect();
-        assert_eq!(bytes, [None, Some(&[2; 72][..])]);
+        assert_eq!(bytes, [None, Some(&[2; 80][..])]);
     }
 
     #[test]
