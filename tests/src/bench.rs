@@ -16,7 +16,7 @@ mod wire;
 
 use std::collections::HashMap;
 
-use bus_model::Transmission;
+use bus_model::Attempt;
 use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
 use model::scenario::{Scenario, contact_words};
@@ -161,7 +161,7 @@ impl Bench {
 
     /// Returns the transmissions on the real bus, in order of time; a tag is an index into [`Bench::requested`].
     #[must_use]
-    pub fn attempts(&self) -> &[Transmission<u64>] {
+    pub fn attempts(&self) -> &[Attempt] {
         self.real.as_ref().map_or(&[], |real| &real.attempts)
     }
 

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::num::NonZeroU32;
 
-use bus_model::{NodeBus, QueueOrder, Transmission, TransmitQueue};
+use bus_model::{Attempt, BusFrame, NodeBus, QueueOrder, TransmitQueue};
 use protocol::can::Frame;
 use protocol::time::Micros;
 use protocol::wire_time::BitRates;
@@ -22,7 +22,7 @@ pub(crate) struct RealBus<T> {
     /// The time at which the bus is advanced next, if that is scheduled.
     pub(crate) next_advance: Option<Micros>,
     pub(crate) requested: Vec<Requested>,
-    pub(crate) attempts: Vec<Transmission<u64>>,
+    pub(crate) attempts: Vec<Attempt>,
 }
 
 impl<T> RealBus<T> {
@@ -38,8 +38,9 @@ impl<T> RealBus<T> {
 
     /// Requests the transmission of a frame.
     pub(crate) fn request(&mut self, now: Micros, frame: &Frame, item: T) {
+        let Some(on_bus) = BusFrame::from_frame(frame) else { return };
         let tag = u64::try_from(self.requested.len()).unwrap_or(u64::MAX);
-        if self.bus.request(now.0 * 1_000, 0, frame, tag).is_ok() {
+        if self.bus.request(now.0 * 1_000, 0, on_bus, tag).is_ok() {
             self.requested.push((now, *frame));
             self.waiting.insert(tag, item);
         }

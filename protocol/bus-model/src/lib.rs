@@ -31,7 +31,7 @@ use std::collections::{BinaryHeap, VecDeque};
 
 use protocol::wire_time::{BitRates, FrameBits};
 
-pub use nodes::{NodeBus, QueueOrder, RequestRefused, Transmission, TransmitQueue, TransmitQueueError};
+pub use nodes::{BusFrame, NodeBus, QueueFull, QueueOrder, TransmitQueue, TransmitQueueError};
 pub use noise::{BitErrors, BitErrorsError, ERROR_FRAME_BITS};
 pub use priority::Priority;
 
@@ -236,13 +236,6 @@ impl<T: Copy> BusModel<T> {
             None if self.contenders.is_empty() => None,
             None => Some(self.free_at.max(self.ready_at) + 1),
         }
-    }
-
-    /// Returns the tags of all waiting frames, including the one on the wire, in no particular order.
-    pub fn waiting_tags(&self) -> impl Iterator<Item = T> + '_ {
-        let on_wire = self.on_wire.iter().map(|(waiting, _)| waiting);
-        let queued = self.queues.iter().flat_map(|queue| &queue.waiting_frames);
-        on_wire.chain(&self.contenders).chain(queued).map(|waiting| waiting.request.tag)
     }
 
     /// Returns the number of waiting frames, including the one on the wire.

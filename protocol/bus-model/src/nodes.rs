@@ -1,10 +1,11 @@
 //! The nodes of a bus, each with a transmit queue of limited depth.
 //!
 //! ```text
-//!   request(at, node, frame) ──> queue of the node ──> BusModel ──> poll: Transmission, …
+//!   request(at, node, frame) ──> queue of the node ──> BusModel ──> poll: Attempt, …
 //!                                  └─ full: refused
 //! ```
 
+use std::collections::VecDeque;
 use std::fmt;
 use std::num::NonZeroU32;
 use std::str::FromStr;
@@ -84,32 +85,26 @@ impl fmt::Display for TransmitQueue {
     }
 }
 
-/// The reason why a frame was not put into a transmit queue.
+/// The refusal of a frame by a full transmit queue.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
-pub enum RequestRefused {
-    /// The transmit queue of the node is full.
-    #[error("the transmit queue is full")]
-    QueueFull,
-    /// The frame is an error frame of a driver, which no node can request.
-    #[error("an error frame cannot be requested")]
-    NotAFrame,
+#[error("the transmit queue is full")]
+pub struct QueueFull;
+
+/// The properties of a frame that decide when a bus sends it.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct BusFrame {
+    /// Priority in arbitration.
+    pub priority: Priority,
+    /// Number of bits, by bit rate.
+    pub bits: FrameBits,
 }
 
-/// One transmission of a frame, complete or damaged.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Transmission<T> {
-    /// Number of the sending node.
-    pub node: u16,
-    /// Tag of the caller.
-    pub tag: T,
-    /// Time of the request in ns.
-    pub at: u64,
-    /// Start of the first bit in ns.
-    pub start: u64,
-    /// End of the intermission in ns.
-    pub end: u64,
-    /// True if the frame was damaged, so that it is transmitted again.
-    pub is_damaged: bool,
+impl BusFrame {
+    /// Returns the properties of a frame; `None` for an error frame of a driver, which no node can request.
+    #[must_use]
+    pub fn from_frame(frame: &Frame) -> Option<Self> {
+        Some(Self { priority: Priority::from_frame(frame), bits: FrameBits::from_frame(frame)? })
+    }
 }
 
 /// A bus whose nodes have transmit queues of limited depth. Times are in ns from an arbitrary origin.
@@ -119,7 +114,7 @@ pub struct NodeBus<T> {
     queue: TransmitQueue,
     /// Number of frames in the queue of each node.
     waiting: Vec<u32>,
-    ended: std::collections::VecDeque<Transmission<T>>,
+    ended: VecDeque<Attempt<T>>,
 }
 
 impl<T: Copy> NodeBus<T> {
@@ -131,7 +126,7 @@ impl<T: Copy> NodeBus<T> {
             model: errors.into_iter().fold(model, BusModel::with_errors),
             queue,
             waiting: Vec::new(),
-            ended: std::collections::VecDeque::new(),
+            ended: VecDeque::new(),
         }
     }
 
@@ -139,34 +134,33 @@ impl<T: Copy> NodeBus<T> {
     /// has the time of the previous one. Returns the time of the request.
     ///
     /// # Errors
-    /// Returns the reason if the frame cannot be queued. The time advances all the same.
-    pub fn request(&mut self, at: u64, node: u16, frame: &Frame, tag: T) -> Result<u64, RequestRefused> {
+    /// Returns [`QueueFull`] if the transmit queue of the node has no room. The time advances all the same.
+    pub fn request(&mut self, at: u64, node: u16, frame: BusFrame, tag: T) -> Result<u64, QueueFull> {
         let at = self.advance(at);
-        let bits = FrameBits::from_frame(frame).ok_or(RequestRefused::NotAFrame)?;
         let TransmitQueue { order, depth } = self.queue;
         let waiting = self.waiting_of(node);
         if *waiting >= depth.get() {
-            return Err(RequestRefused::QueueFull);
+            return Err(QueueFull);
         }
         *waiting += 1;
         let queue = match order {
             QueueOrder::Fifo => Some(node),
             QueueOrder::Priority => None,
         };
-        let priority = Priority::from_frame(frame);
+        let BusFrame { priority, bits } = frame;
         self.model.request(Request { at, priority, bits, queue, tag: (node, tag) });
         Ok(at)
     }
 
     /// Advances the time to `until`, unless it is later already. Returns the time. [`NodeBus::poll`] then returns the
-    /// transmissions that have ended until then.
+    /// attempts that have ended until then.
     pub fn advance(&mut self, until: u64) -> u64 {
         let now = self.model.run_until(until);
         while let Some(Attempt { tag: (node, tag), at, start, end, is_damaged }) = self.model.poll() {
             if !is_damaged {
                 *self.waiting_of(node) -= 1;
             }
-            self.ended.push_back(Transmission { node, tag, at, start, end, is_damaged });
+            self.ended.push_back(Attempt { tag, at, start, end, is_damaged });
         }
         now
     }
@@ -178,12 +172,12 @@ impl<T: Copy> NodeBus<T> {
         }
     }
 
-    /// Returns the next transmission that has ended, in order of time; `None` if there are no more.
-    pub fn poll(&mut self) -> Option<Transmission<T>> {
+    /// Returns the next attempt that has ended, in order of time; `None` if there are no more.
+    pub fn poll(&mut self) -> Option<Attempt<T>> {
         self.ended.pop_front()
     }
 
-    /// Returns the time in ns at which the next transmission ends if no further request is made; `None` if no frame
+    /// Returns the time in ns at which the next attempt ends if no further request is made; `None` if no frame
     /// waits.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<u64> {
@@ -206,11 +200,6 @@ impl<T: Copy> NodeBus<T> {
     #[must_use]
     pub const fn max_waiting(&self) -> usize {
         self.model.max_waiting()
-    }
-
-    /// Returns the tags of all waiting frames, including the one on the wire, in no particular order.
-    pub fn waiting_tags(&self) -> impl Iterator<Item = (u16, T)> + '_ {
-        self.model.waiting_tags()
     }
 
     fn waiting_of(&mut self, node: u16) -> &mut u32 {
@@ -236,8 +225,8 @@ mod tests {
         std::iter::from_fn(|| bus.poll()).map(|sent| sent.tag).collect()
     }
 
-    fn frame(id: u32) -> Frame {
-        Frame::classic(id, &[1, 2, 3, 4]).unwrap()
+    fn frame(id: u32) -> BusFrame {
+        BusFrame::from_frame(&Frame::classic(id, &[1, 2, 3, 4]).unwrap()).unwrap()
     }
 
     #[test]
@@ -247,12 +236,9 @@ mod tests {
             let mut bus = bus(queue);
             for ((node, id), tag) in requests.into_iter().zip(0..) {
                 // The first frame is on the wire when the others are requested.
-                bus.request(tag, node, &frame(id), tag).unwrap();
+                bus.request(tag, node, frame(id), tag).unwrap();
             }
             assert_eq!((bus.waiting(), bus.max_waiting()), (5, 5));
-            let mut tags: Vec<_> = bus.waiting_tags().map(|(_, tag)| tag).collect();
-            tags.sort_unstable();
-            assert_eq!(tags, [0, 1, 2, 3, 4]);
             assert_eq!(sent(&mut bus), expected, "{queue}");
         }
     }
@@ -260,13 +246,13 @@ mod tests {
     #[test]
     fn a_full_queue_refuses_frames_until_one_is_sent() {
         let mut bus = bus("priority:2");
-        let took = FrameBits::from_frame(&frame(1)).unwrap().nanoseconds(bus.rates());
-        assert_eq!(bus.request(5, 1, &frame(1), 0), Ok(5));
-        assert_eq!(bus.request(5, 1, &frame(2), 1), Ok(5));
-        assert_eq!(bus.request(6, 1, &frame(0), 2), Err(RequestRefused::QueueFull));
-        assert_eq!(bus.request(3, 2, &frame(3), 3), Ok(6), "not earlier than the previous one");
-        assert_eq!(bus.request(4 + took, 1, &frame(4), 4), Err(RequestRefused::QueueFull));
-        assert_eq!(bus.request(5 + took, 1, &frame(4), 5), Ok(5 + took));
+        let took = frame(1).bits.nanoseconds(bus.rates());
+        assert_eq!(bus.request(5, 1, frame(1), 0), Ok(5));
+        assert_eq!(bus.request(5, 1, frame(2), 1), Ok(5));
+        assert_eq!(bus.request(6, 1, frame(0), 2), Err(QueueFull));
+        assert_eq!(bus.request(3, 2, frame(3), 3), Ok(6), "not earlier than the previous one");
+        assert_eq!(bus.request(4 + took, 1, frame(4), 4), Err(QueueFull));
+        assert_eq!(bus.request(5 + took, 1, frame(4), 5), Ok(5 + took));
         assert_eq!(sent(&mut bus), [0, 1, 3, 5]);
     }
 
@@ -275,20 +261,20 @@ mod tests {
         let errors = BitErrors::new(0.01, 1).unwrap();
         let mut bus = NodeBus::new("1M".parse().unwrap(), "fifo:3".parse().unwrap(), Some(errors));
         for tag in 0..3 {
-            bus.request(0, 7, &frame(9), tag).unwrap();
+            bus.request(0, 7, frame(9), tag).unwrap();
         }
         bus.finish();
         let all: Vec<_> = std::iter::from_fn(|| bus.poll()).collect();
         assert!(all.iter().any(|it| it.is_damaged), "{all:?}");
         assert_eq!(all.iter().filter(|it| !it.is_damaged).map(|it| it.tag).collect::<Vec<_>>(), [0, 1, 2]);
         assert!(all.windows(2).all(|pair| pair[0].end == pair[1].start), "{all:?}");
-        assert_eq!(bus.request(all.last().unwrap().end, 7, &frame(9), 3).map(|_| ()), Ok(()));
+        assert_eq!(bus.request(all.last().unwrap().end, 7, frame(9), 3).map(|_| ()), Ok(()));
     }
 
     #[test]
     fn an_error_frame_is_no_request() {
         let error = Frame::classic(protocol::can::ERROR | 4, &[0; 8]).unwrap();
-        assert_eq!(bus("fifo").request(0, 0, &error, 0), Err(RequestRefused::NotAFrame));
+        assert_eq!(BusFrame::from_frame(&error), None);
     }
 
     #[test]

@@ -4,7 +4,7 @@
 
 use std::fmt::Write;
 
-use bus_model::{BitErrors, NodeBus, QueueOrder, RequestRefused};
+use bus_model::{BitErrors, BusFrame, NodeBus, QueueFull, QueueOrder};
 use protocol::can::{BIT_RATE_SWITCH, ERROR_STATE, EXTENDED, Frame};
 use protocol::wire_time::BitRates;
 use rand::{RngExt, SeedableRng};
@@ -64,10 +64,10 @@ fn requests(dice: &mut Pcg64Mcg, count: usize, rates: BitRates) -> Vec<FrameRequ
 fn results_of_server(bus: &mut NodeBus<usize>, requests: &[FrameRequest]) -> BusResult {
     let mut result = BusResult::default();
     for (index, request) in requests.iter().enumerate() {
-        match bus.request(request.at, request.node, &request.frame, index) {
+        let on_bus = BusFrame::from_frame(&request.frame).expect("no request is an error frame");
+        match bus.request(request.at, request.node, on_bus, index) {
             Ok(at) => assert_eq!(at, request.at),
-            Err(RequestRefused::QueueFull) => result.refused.push(index),
-            Err(RequestRefused::NotAFrame) => unreachable!("no request is an error frame"),
+            Err(QueueFull) => result.refused.push(index),
         }
     }
     bus.finish();

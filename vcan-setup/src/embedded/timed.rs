@@ -12,7 +12,7 @@
 use std::collections::{BTreeMap, HashMap};
 
 use bus_model::traffic::{RunEvent, TrafficClassifier};
-use bus_model::{BitErrors, NodeBus, RequestRefused, TransmitQueue};
+use bus_model::{BitErrors, BusFrame, NodeBus, TransmitQueue};
 use protocol::can::Frame;
 use protocol::wire_time::BitRates;
 
@@ -168,21 +168,19 @@ impl TimedBus {
         requested.at = self.bus.advance(requested.at.min(now));
         self.take_sent(effects);
         let RequestedFrame { at, from, node, parcel, frame, is_bench, .. } = requested;
-        let passes = is_bench && !self.options.counts_bench_traffic;
-        let outcome =
-            if passes { Err(RequestRefused::NotAFrame) } else { self.bus.request(at, node, &frame, number) };
-        let (word, shown) = match outcome {
-            Ok(_) => {
-                self.counts.requested += 1;
-                self.queued.insert(number, requested);
-                ('Q', Some(number))
-            }
-            Err(RequestRefused::NotAFrame) => {
+        let takes_time = !is_bench || self.options.counts_bench_traffic;
+        let (word, shown) = match BusFrame::from_frame(&frame).filter(|_| takes_time) {
+            None => {
                 self.counts.beside += 1;
                 effects.deliveries.push(Delivery { from, parcel, stamp: at, is_bench: true });
                 ('B', None)
             }
-            Err(RequestRefused::QueueFull) => {
+            Some(on_bus) if self.bus.request(at, node, on_bus, number).is_ok() => {
+                self.counts.requested += 1;
+                self.queued.insert(number, requested);
+                ('Q', Some(number))
+            }
+            Some(_) => {
                 self.counts.refuse(frame.raw_id());
                 let refusal = from.map(|from| Refusal { from, raw_id: frame.raw_id() });
                 effects.refusals.extend(refusal);

@@ -15,7 +15,7 @@ use super::{MAX_WAITING_FRAMES, REORDER_WINDOW_NS, SATURATED_NS};
 use crate::fit;
 use crate::fit::verdict::{AnsweringCells, FitSummary};
 use bus_model::traffic::{ClassifiedFrame, RunEvent, TrafficClassifier};
-use bus_model::{BitErrors, NodeBus, QueueOrder, Transmission, TransmitQueue};
+use bus_model::{Attempt, BitErrors, BusFrame, NodeBus, Priority, QueueOrder, TransmitQueue};
 
 /// The transmit queue of all senders on a bus: some minutes of a bus at full load. Every frame takes part in
 /// arbitration.
@@ -40,8 +40,7 @@ struct FrameTag {
 #[derive(Clone, Copy, Debug)]
 struct PendingFrame {
     at: u64,
-    frame: Frame,
-    bits: FrameBits,
+    on_bus: BusFrame,
     place: u64,
     /// Identifier of the frame; `None` for one of 29 bits.
     id: Option<u16>,
@@ -145,7 +144,13 @@ impl BusTiming {
             first.into_iter().for_each(|first| first.sorted.bench = sorted.bench);
         }
         self.phases.beginning.record_event(nanos, sorted.says);
-        let pending = PendingFrame { at: nanos, frame: *frame, bits, place, id, sorted };
+        let pending = PendingFrame {
+            at: nanos,
+            on_bus: BusFrame { priority: Priority::from_frame(frame), bits },
+            place,
+            id,
+            sorted,
+        };
         match self.pending.back() {
             Some(last) if last.at > nanos => {
                 self.counts.out_of_order += 1;
@@ -181,7 +186,7 @@ impl BusTiming {
 
     /// Passes the next frame in order of time to the model, which requests its transmission.
     fn request_frame(&mut self, pending: PendingFrame, mut reported: Option<&mut FrameTimings>) {
-        let PendingFrame { at, frame, bits, place, id, sorted } = pending;
+        let PendingFrame { at, on_bus, place, id, sorted } = pending;
         let ClassifiedFrame { says, bench, from, .. } = sorted;
         if let Some(bench) = bench {
             self.counts.bench.count_frames(bench, 1);
@@ -197,7 +202,7 @@ impl BusTiming {
         self.collect_sent_frames(reported.as_deref_mut());
         let phase = self.phases.phase_at(at, says, self.traffic.is_skin_traffic());
         let answer = self.epochs.record_event(at, says, from);
-        let took = bits.nanoseconds(self.model.rates());
+        let took = on_bus.bits.nanoseconds(self.model.rates());
         if self.known.is_timed {
             self.record_ended(at, took, phase, answer);
             reported
@@ -208,7 +213,7 @@ impl BusTiming {
         let figures = self.figures.get_mut(phase);
         figures.record_request(at, took);
         let tag = FrameTag { place, id, phase, answer };
-        if self.model.request(at, 0, &frame, tag).is_err() {
+        if self.model.request(at, 0, on_bus, tag).is_err() {
             self.counts.no_room += 1;
             reported.into_iter().for_each(|reported| reported.record_sent(place, None));
             return;
@@ -239,9 +244,7 @@ impl BusTiming {
     /// Takes completed transmissions from the model and records them.
     fn collect_sent_frames(&mut self, mut reported: Option<&mut FrameTimings>) {
         while let Some(sent) = self.model.poll() {
-            let Transmission {
-                tag: FrameTag { place, id, phase, answer }, at, start, end, is_damaged, ..
-            } = sent;
+            let Attempt { tag: FrameTag { place, id, phase, answer }, at, start, end, is_damaged } = sent;
             self.wire_end = end;
             self.figures.get_mut(self.phases.current_phase()).busy.record_transmission(
                 start,

@@ -6,7 +6,7 @@ use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
-use bus_model::{Transmission, TransmitQueue};
+use bus_model::{Attempt, TransmitQueue};
 use protocol::can::Frame;
 use protocol::candump::write_frame;
 use protocol::wire_time::BitRates;
@@ -60,7 +60,7 @@ impl BusRecord {
     }
 
     /// Writes a transmission: `S` sent, `D` damaged.
-    pub(super) fn write_transmission(&mut self, sent: &Transmission<u64>) {
+    pub(super) fn write_transmission(&mut self, sent: &Attempt) {
         let word = if sent.is_damaged { 'D' } else { 'S' };
         self.write(format_args!("{word} {} {} {}", sent.tag, sent.start, sent.end));
     }

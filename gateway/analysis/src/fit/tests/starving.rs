@@ -1,6 +1,6 @@
 //! The frames that starve, compared with a saturated bus in virtual time.
 
-use bus_model::{NodeBus, TransmitQueue};
+use bus_model::{BusFrame, NodeBus, TransmitQueue};
 use model::generate::{ReplyMode, SkinRequest};
 use protocol::can::{BIT_RATE_SWITCH, Format, Frame};
 use protocol::wire_time::{BitRates, FrameBits};
@@ -65,12 +65,13 @@ fn simulated(senders: &[Sender], rates: BitRates) -> Vec<u32> {
         requests.extend(times.flat_map(|at| sender.frames.iter().map(move |frame| (at, index, frame))));
     }
     requests.sort_by_key(|(at, index, _)| (*at, *index));
+    let mut unsent = vec![0; senders.len()];
     for (at, index, frame) in requests {
-        bus.request(at, senders[index].node, frame, index).unwrap();
+        bus.request(at, senders[index].node, BusFrame::from_frame(frame).unwrap(), index).unwrap();
+        unsent[index] += 1;
     }
     bus.advance(END_NS);
-    let mut unsent = vec![0; senders.len()];
-    bus.waiting_tags().for_each(|(_, index)| unsent[index] += 1);
+    std::iter::from_fn(|| bus.poll()).for_each(|sent| unsent[sent.tag] -= 1);
     let starving = senders.iter().zip(unsent).filter(|(_, unsent)| *unsent > MAX_UNSENT);
     starving.map(|(sender, _)| sender.id).collect()
 }
