@@ -2,6 +2,7 @@
 
 use bench::remote::BenchCommand;
 use model::scenario::ProcessAction;
+use protocol::message::Message;
 use protocol::skin::{CellName, Skin};
 use serde::{Deserialize, Deserializer, de};
 use serde_json::Value;
@@ -101,30 +102,76 @@ impl ControlCommand {
         }
     }
 
-    /// Returns the command for the run; `None` for commands that are carried out on the buses.
-    #[must_use]
-    pub fn bench_command(&self, skin: &Skin) -> Option<Result<BenchCommand, String>> {
+    /// Finds the cells and buses of the command in the skin.
+    ///
+    /// # Errors
+    /// Returns the reason if the skin has no such cell or bus, or if a name is ambiguous.
+    pub fn resolve(&self, skin: &Skin) -> Result<ResolvedCommand, String> {
         let process = |action, cell: &CellReference| {
             let (bus, node) = cell.find(skin)?;
-            Ok(BenchCommand::Process { action, bus, node: node.get() })
+            Ok::<_, String>(ResolvedCommand::Bench(BenchCommand::Process { action, bus, node: node.get() }))
         };
-        Some(match self {
-            Self::Kill { cell } => process(ProcessAction::Kill, cell),
-            Self::Stop { cell } => process(ProcessAction::Stop, cell),
-            Self::Continue { cell } => process(ProcessAction::Continue, cell),
-            Self::Restart { cell } => process(ProcessAction::Restart, cell),
-            Self::Bus { bus, down } => find_bus(skin, bus).map(|bus| BenchCommand::Bus { down: *down, bus }),
-            Self::Link { cells: [one, other], down } => find_cells_of_link(skin, one, other)
-                .map(|(bus, nodes)| BenchCommand::Link { down: *down, bus, nodes }),
-            Self::End {} => Ok(BenchCommand::End),
-            Self::Press { .. }
-            | Self::Release { .. }
-            | Self::Halt {}
-            | Self::Resume {}
-            | Self::Epochs { .. }
-            | Self::Report {} => return None,
+        Ok(match self {
+            Self::Kill { cell } => process(ProcessAction::Kill, cell)?,
+            Self::Stop { cell } => process(ProcessAction::Stop, cell)?,
+            Self::Continue { cell } => process(ProcessAction::Continue, cell)?,
+            Self::Restart { cell } => process(ProcessAction::Restart, cell)?,
+            Self::Bus { bus, down } => {
+                ResolvedCommand::Bench(BenchCommand::Bus { down: *down, bus: find_bus(skin, bus)? })
+            }
+            Self::Link { cells: [one, other], down } => {
+                let (bus, nodes) = find_cells_of_link(skin, one, other)?;
+                ResolvedCommand::Bench(BenchCommand::Link { down: *down, bus, nodes })
+            }
+            Self::End {} => ResolvedCommand::Bench(BenchCommand::End),
+            Self::Press { cell, force_n } => {
+                ResolvedCommand::Direct(DirectCommand::Press { cell: cell.find(skin)?, force_n: *force_n })
+            }
+            Self::Release { cell } => {
+                let cell = cell.as_ref().map(|cell| cell.find(skin)).transpose()?;
+                ResolvedCommand::Direct(DirectCommand::Release { cell })
+            }
+            Self::Halt {} => ResolvedCommand::Direct(DirectCommand::Send(Message::Halt)),
+            Self::Resume {} => ResolvedCommand::Direct(DirectCommand::Send(Message::Resume)),
+            Self::Epochs { every } => ResolvedCommand::Direct(DirectCommand::Epochs { every: *every }),
+            Self::Report {} => ResolvedCommand::Direct(DirectCommand::Report),
         })
     }
+}
+
+/// A command whose cells and buses were found in the skin.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum ResolvedCommand {
+    /// A command to the main thread of the run.
+    Bench(BenchCommand),
+    /// A command that the page's server or the control channel carries out itself.
+    Direct(DirectCommand),
+}
+
+/// A command that the page's server or the control channel carries out itself.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum DirectCommand {
+    /// Presses a cell.
+    Press {
+        /// The cell.
+        cell: CellKey,
+        /// The force in N.
+        force_n: f64,
+    },
+    /// Releases a cell, or with `None` all that the program or page presses.
+    Release {
+        /// The cell.
+        cell: Option<CellKey>,
+    },
+    /// Sends a message on all buses.
+    Send(Message),
+    /// Requests an event for every Nth epoch.
+    Epochs {
+        /// N; 0 ends the events.
+        every: u32,
+    },
+    /// Requests the state of the bench.
+    Report,
 }
 
 impl CellReference {
@@ -224,13 +271,16 @@ mod tests {
             ),
         ] {
             let command: ControlCommand = serde_json::from_str(command).unwrap();
-            let found = command.bench_command(&skin).unwrap();
+            let found = command.resolve(&skin).map(|resolved| match resolved {
+                ResolvedCommand::Bench(command) => command,
+                ResolvedCommand::Direct(command) => panic!("{command:?}"),
+            });
             assert_eq!(
                 found.map(|it| serde_json::to_string(&it).unwrap()),
                 expected.map(str::to_owned).map_err(str::to_owned)
             );
         }
         let halt: ControlCommand = serde_json::from_str(r#"{"do":"halt"}"#).unwrap();
-        assert_eq!(halt.bench_command(&skin), None);
+        assert_eq!(halt.resolve(&skin), Ok(ResolvedCommand::Direct(DirectCommand::Send(Message::Halt))));
     }
 }

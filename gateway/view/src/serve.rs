@@ -17,7 +17,7 @@ use protocol::message::{Message, SensorPage, StimulusStart};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
-use crate::command::ControlCommand;
+use crate::command::{ControlCommand, DirectCommand, ResolvedCommand};
 use crate::followed::{BusOpener, FollowedBus, time_of_read_frames};
 use crate::live::{LiveState, StatusMessage};
 use crate::lock_ignoring_poison;
@@ -135,14 +135,13 @@ fn publish_and_execute(
     while !stop.load(Ordering::Relaxed) {
         for (page, command) in server.commands() {
             let is_done = match command {
-                PageCommand::Control(command) => {
-                    let live = lock_ignoring_poison(live);
-                    match command.bench_command(live.skin()) {
-                        None => execute_command(page, &command, &live, &mut pressed, buses),
-                        Some(Ok(command)) => bench.as_mut().is_some_and(|run| run.send(&command)),
-                        Some(Err(_)) => false,
-                    }
-                }
+                PageCommand::Control(command) => execute_command(
+                    (page, &command),
+                    &lock_ignoring_poison(live),
+                    &mut pressed,
+                    buses,
+                    bench.as_mut(),
+                ),
                 // The server handles selections, and there is no recording to be played.
                 PageCommand::Select(_) | PageCommand::Playback(_) => false,
             };
@@ -198,37 +197,35 @@ fn to_json(said: &StatusMessage) -> String {
     serde_json::to_string(said).unwrap_or_default()
 }
 
-/// Executes a command of a page on the buses. Returns false if the skin has no such cell, or if the command is not one
-/// of a page.
+/// Executes a command of a page. Returns false if it has no effect: there is no such cell or bus, the cell may not be
+/// pressed, no run takes the command, or it is not one of a page.
 fn execute_command(
-    page: u64,
-    command: &ControlCommand,
+    (page, command): (u64, &ControlCommand),
     live: &LiveState,
     pressed: &mut TouchRegistry,
     buses: &[FollowedBus],
+    bench: Option<&mut JsonPipe>,
 ) -> bool {
-    let everywhere = |message: &Message| buses.iter().for_each(|bus| _ = bus.send(message));
-    match command {
-        ControlCommand::Press { cell, force_n } => {
-            let cell = cell.find(live.skin()).ok().filter(|&cell| live.is_pressable(cell));
-            match cell {
-                Some(cell) => pressed.press(page, cell, *force_n),
-                None => pressed.release(page),
-            }
-            return cell.is_some();
+    // A touch that is not possible ends the one before it.
+    let is_touch = matches!(command, ControlCommand::Press { .. } | ControlCommand::Release { .. });
+    match command.resolve(live.skin()) {
+        Ok(ResolvedCommand::Bench(command)) => return bench.is_some_and(|run| run.send(&command)),
+        Ok(ResolvedCommand::Direct(DirectCommand::Press { cell, force_n })) if live.is_pressable(cell) => {
+            pressed.press(page, cell, force_n);
         }
-        ControlCommand::Release { .. } => pressed.release(page),
-        ControlCommand::Halt {} => everywhere(&Message::Halt),
-        ControlCommand::Resume {} => everywhere(&Message::Resume),
-        ControlCommand::Kill { .. }
-        | ControlCommand::Stop { .. }
-        | ControlCommand::Continue { .. }
-        | ControlCommand::Restart { .. }
-        | ControlCommand::Bus { .. }
-        | ControlCommand::Link { .. }
-        | ControlCommand::Epochs { .. }
-        | ControlCommand::Report {}
-        | ControlCommand::End {} => return false,
+        Ok(ResolvedCommand::Direct(DirectCommand::Release { .. })) => pressed.release(page),
+        Ok(ResolvedCommand::Direct(DirectCommand::Send(message))) => {
+            buses.iter().for_each(|bus| _ = bus.send(&message));
+        }
+        Ok(ResolvedCommand::Direct(
+            DirectCommand::Press { .. } | DirectCommand::Epochs { .. } | DirectCommand::Report,
+        ))
+        | Err(_) => {
+            if is_touch {
+                pressed.release(page);
+            }
+            return false;
+        }
     }
     true
 }

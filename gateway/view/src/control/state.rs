@@ -15,7 +15,7 @@ use super::bus::ControlBus;
 use super::event::{AskedStimulus, ControlEvent, JointTorques, ReadyBus, ReportedBus, RequestId};
 use super::presses::Press;
 use super::request::{InputLine, Request};
-use crate::command::ControlCommand;
+use crate::command::{ControlCommand, DirectCommand, ResolvedCommand};
 
 /// The maximum number of commands that the run carries out at once. It keeps more answers than that.
 const MAX_COMMANDS_IN_FLIGHT: usize = 4;
@@ -236,7 +236,8 @@ impl ControlState {
         while self.is_ready
             && let Some(line) = self.waiting.front()
         {
-            let is_for_run = matches!(line, InputLine::Request(request) if request.command.bench_command(&self.skin).is_some_and(|it| it.is_ok()));
+            let is_for_run = matches!(line, InputLine::Request(request)
+                if matches!(request.command.resolve(&self.skin), Ok(ResolvedCommand::Bench(_))));
             let in_flight = self.in_flight.len();
             if in_flight >= MAX_COMMANDS_IN_FLIGHT || in_flight > 0 && !is_for_run {
                 return;
@@ -263,15 +264,15 @@ impl ControlState {
             return self.output.events.push(ControlEvent::Error { id, text: "the run is ending".to_owned() });
         }
         let name = command.name();
-        let done = match command.bench_command(&self.skin) {
-            Some(Ok(bench)) => {
+        let done = match command.resolve(&self.skin) {
+            Ok(ResolvedCommand::Bench(bench)) => {
                 self.is_ending |= bench == BenchCommand::End;
                 self.output.commands.push(bench);
                 self.in_flight.push_back((id, name));
                 return;
             }
-            Some(Err(reason)) => Err(reason),
-            None => self.execute(now, id.clone(), &command),
+            Ok(ResolvedCommand::Direct(command)) => self.execute((now, id.clone(), name), command),
+            Err(reason) => Err(reason),
         };
         match done {
             Ok(None) => {}
@@ -291,47 +292,35 @@ impl ControlState {
     /// its own.
     fn execute(
         &mut self,
-        now: Micros,
-        id: Option<RequestId>,
-        command: &ControlCommand,
+        (now, id, name): (Micros, Option<RequestId>, &'static str),
+        command: DirectCommand,
     ) -> Result<Option<String>, String> {
         match command {
-            ControlCommand::Press { cell, force_n } => {
-                let cell = cell.find(&self.skin)?;
-                self.press_and_answer((now, id, "press"), cell, *force_n)?;
+            DirectCommand::Press { cell, force_n } => {
+                self.press_and_answer((now, id, name), cell, force_n)?;
                 Ok(None)
             }
-            ControlCommand::Release { cell: Some(cell) } => {
-                let cell = cell.find(&self.skin)?;
-                self.press_and_answer((now, id, "release"), cell, 0.0)?;
+            DirectCommand::Release { cell: Some(cell) } => {
+                self.press_and_answer((now, id, name), cell, 0.0)?;
                 Ok(None)
             }
-            ControlCommand::Release { cell: None } => self.release_all(now, id).map(Some),
-            ControlCommand::Halt {} | ControlCommand::Resume {} => {
-                let is_halt = matches!(command, ControlCommand::Halt {});
-                let message = if is_halt { Message::Halt } else { Message::Resume };
+            DirectCommand::Release { cell: None } => self.release_all(now, id).map(Some),
+            DirectCommand::Send(message) => {
                 self.output.messages.extend((0..self.buses.len()).map(|bus| (bus, message)));
-                Ok(Some(format!("{} all cells", command.name())))
+                Ok(Some(format!("{name} all cells")))
             }
-            ControlCommand::Epochs { every } => {
-                self.every = u64::from(*every);
+            DirectCommand::Epochs { every } => {
+                self.every = u64::from(every);
                 Ok(Some(match every {
                     0 => "report no epochs".to_owned(),
                     every => format!("report every epoch whose number is a multiple of {every}"),
                 }))
             }
-            ControlCommand::Report {} => {
+            DirectCommand::Report => {
                 let report = self.report(id, now);
                 self.output.events.push(report);
                 Ok(Some("report the state".to_owned()))
             }
-            ControlCommand::Kill { .. }
-            | ControlCommand::Stop { .. }
-            | ControlCommand::Continue { .. }
-            | ControlCommand::Restart { .. }
-            | ControlCommand::Bus { .. }
-            | ControlCommand::Link { .. }
-            | ControlCommand::End {} => Ok(None),
         }
     }
 
