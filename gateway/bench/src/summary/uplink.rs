@@ -68,34 +68,35 @@ impl UplinkSummary {
         }
     }
 
-    /// Attributes up to `at_most` of the unknown losses to transmit queues of a timed bus.
-    pub(super) fn attribute_losses_to_queues(&mut self, at_most: u64) {
+    /// Takes up to `at_most` from the unknown losses, and returns their number.
+    fn explain_losses(&mut self, at_most: u64) -> u64 {
         let explained = self.unknown.min(at_most);
         self.unknown -= explained;
-        self.queues += explained;
+        explained
+    }
+
+    /// Attributes up to `at_most` of the unknown losses to transmit queues of a timed bus.
+    pub(super) fn attribute_losses_to_queues(&mut self, at_most: u64) {
+        self.queues += self.explain_losses(at_most);
     }
 
     /// Cancels unknown losses against the surplus. On a timed bus, packets of a cell overtake its heartbeat: they are
     /// a surplus before it, and seem lost after it.
     pub(super) fn cancel_overtaken(&mut self) {
-        let overtaken = self.unknown.min(self.surplus);
-        self.unknown -= overtaken;
+        let overtaken = self.explain_losses(self.surplus);
         self.surplus -= overtaken;
         self.overtaken += overtaken;
     }
 
     /// Attributes up to `at_most` of the unknown losses to links between hosts.
     pub fn attribute_losses_to_hosts(&mut self, at_most: u64) {
-        let explained = self.unknown.min(at_most);
-        self.unknown -= explained;
-        self.hosts += explained;
+        self.hosts += self.explain_losses(at_most);
     }
 
     /// Attributes up to `at_most` of the unknown losses to the kernel's backlog. Returns the number of packets
     /// attributed.
     pub fn attribute_losses_to_backlog(&mut self, at_most: u64) -> u64 {
-        let explained = self.unknown.min(at_most);
-        self.unknown -= explained;
+        let explained = self.explain_losses(at_most);
         self.backlog += explained;
         explained
     }
