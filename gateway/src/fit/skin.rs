@@ -1,6 +1,6 @@
 //! Fit of a skin on real buses in the worst case.
 
-use analysis::fit::{self, BusFit, PAPER_COMPUTATION_NS, rates};
+use analysis::fit::{self, BusFit, PAPER_COMPUTATION_NS};
 use protocol::can::Format;
 use protocol::skin::{Skin, SkinBus};
 use protocol::usage::{Failure, print_text};
@@ -73,7 +73,7 @@ impl FitCommand {
 
 /// Returns the bit rates that the skin gives for a bus, with the format.
 fn bit_rates_from_skin(bus: &SkinBus, format: Format) -> Result<Option<(Format, BitRates)>, Failure> {
-    let rates = rates::described_rates(bus, format).transpose();
+    let rates = bus.described_rates(format).transpose();
     let rates = rates.map_err(|error| Failure::usage_error(format!("bus {}: {error}", bus.name)))?;
     Ok(rates.map(|rates| (format, rates)))
 }

@@ -4,10 +4,6 @@ use protocol::can::Format;
 use protocol::skin::SkinBus;
 use protocol::wire_time::{BitRates, BitRatesError};
 
-const DEFAULT_NOMINAL_BIT_RATE: u32 = 1_000_000;
-/// The default data bit rate of FD frames, in bit/s.
-const DEFAULT_DATA_BIT_RATE: u32 = 5_000_000;
-
 /// Bit rates that the caller requests for all buses.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct RequestedRates {
@@ -32,8 +28,8 @@ impl RequestedRates {
     /// # Errors
     /// Returns [`BitRatesError`] if CAN does not allow these rates.
     pub fn rates(&self) -> Result<BitRates, BitRatesError> {
-        let nominal = self.nominal.unwrap_or(DEFAULT_NOMINAL_BIT_RATE);
-        BitRates::new(nominal, self.data.unwrap_or_else(|| nominal.max(DEFAULT_DATA_BIT_RATE)))
+        let nominal = self.nominal.unwrap_or(SkinBus::DEFAULT_NOMINAL_BIT_RATE);
+        BitRates::new(nominal, self.data.unwrap_or_else(|| nominal.max(SkinBus::DEFAULT_DATA_BIT_RATE)))
     }
 
     /// Returns the rates of a bus of a skin.
@@ -42,30 +38,21 @@ impl RequestedRates {
     /// Returns [`BitRatesError`] if CAN does not allow these rates.
     pub fn for_bus(&self, bus: &SkinBus) -> Result<ChosenRates, BitRatesError> {
         let is_chosen = self.nominal.is_some() || self.data.is_some() || bus.bitrate.is_some();
-        let rates = match (self.nominal, self.data, described_rates(bus, bus.format)) {
+        let rates = match (self.nominal, self.data, bus.described_rates(bus.format)) {
             (None, None, Some(described)) => described?,
             (nominal, data, _) => {
                 let nominal = nominal.or(bus.bitrate);
                 let data = data.or(bus.data_bitrate);
                 match bus.format {
                     Format::Fd => Self { nominal, data }.rates()?,
-                    Format::Classic => BitRates::classic(nominal.unwrap_or(DEFAULT_NOMINAL_BIT_RATE))?,
+                    Format::Classic => {
+                        BitRates::classic(nominal.unwrap_or(SkinBus::DEFAULT_NOMINAL_BIT_RATE))?
+                    }
                 }
             }
         };
         Ok(ChosenRates { rates, is_chosen })
     }
-}
-
-/// Returns the rates that the skin describes for a bus; the data bit rate defaults to the nominal one. Returns `None`
-/// if the skin gives no rate.
-#[must_use]
-pub fn described_rates(bus: &SkinBus, format: Format) -> Option<Result<BitRates, BitRatesError>> {
-    let nominal = bus.bitrate?;
-    Some(match format {
-        Format::Fd => BitRates::new(nominal, bus.data_bitrate.unwrap_or(nominal)),
-        Format::Classic => BitRates::classic(nominal),
-    })
 }
 
 #[cfg(test)]

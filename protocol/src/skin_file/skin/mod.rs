@@ -18,7 +18,7 @@ mod robot;
 pub mod sensing;
 mod wires;
 
-use crate::wire_time::BitRates;
+use crate::wire_time::{BitRates, BitRatesError};
 use std::path::Path;
 
 use crate::can::Format;
@@ -117,7 +117,7 @@ pub struct SkinBus {
     pub data_bitrate: Option<u32>,
     /// The times at which the cells send measurements.
     pub sensing: Sensing,
-    /// Whether frames take time on an embedded bus.
+    /// Time that frames take on an embedded bus.
     pub time: BusTime,
 }
 
@@ -132,19 +132,31 @@ pub enum BusTime {
 }
 
 impl SkinBus {
-    /// Returns the bit rates of the bus, by default 1 Mbit/s with data at 5 Mbit/s. A data bit rate that is not given is
-    /// the nominal one.
+    /// Nominal bit rate of a bus for which nobody gives one, in bit/s.
+    pub const DEFAULT_NOMINAL_BIT_RATE: u32 = 1_000_000;
+    /// Data bit rate of the FD frames of such a bus, in bit/s.
+    pub const DEFAULT_DATA_BIT_RATE: u32 = 5_000_000;
+
+    /// Returns the rates that the skin describes, for frames of a format; the data bit rate defaults to the nominal one.
+    /// Returns `None` if the skin gives no rate.
+    #[must_use]
+    pub fn described_rates(&self, format: Format) -> Option<Result<BitRates, BitRatesError>> {
+        let nominal = self.bitrate?;
+        Some(match format {
+            Format::Fd => BitRates::new(nominal, self.data_bitrate.unwrap_or(nominal)),
+            Format::Classic => BitRates::classic(nominal),
+        })
+    }
+
+    /// Returns the described bit rates, or else the default ones.
     #[must_use]
     #[expect(clippy::missing_panics_doc, reason = "the file was checked, and the default rates are allowed")]
     pub fn rates_or_default(&self) -> BitRates {
-        let (nominal, data) = self
-            .bitrate
-            .map_or((1_000_000, 5_000_000), |nominal| (nominal, self.data_bitrate.unwrap_or(nominal)));
-        match self.format {
-            Format::Fd => BitRates::new(nominal, data),
-            Format::Classic => BitRates::classic(nominal),
-        }
-        .expect("the rates are in their ranges")
+        let default = || match self.format {
+            Format::Fd => BitRates::new(Self::DEFAULT_NOMINAL_BIT_RATE, Self::DEFAULT_DATA_BIT_RATE),
+            Format::Classic => BitRates::classic(Self::DEFAULT_NOMINAL_BIT_RATE),
+        };
+        self.described_rates(self.format).unwrap_or_else(default).expect("the rates are in their ranges")
     }
 }
 
