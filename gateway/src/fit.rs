@@ -38,8 +38,8 @@ use super::print::comma_separated;
   skinbus fit run.log --skin skin.toml --json | jq -c 'select(.end_s and .end_s - .time > 0.016)'
   skinbus fit vcan0 vcan1 --duration 10")]
 pub(crate) struct FitCommand {
-    /// What to check: a skin file, for its worst case; or traffic, from a candump log, an MCAP recording (all parts of
-    /// a split one) or live buses. - is standard input: a skin if --table, --format or --computation is given, else
+    /// Skin file, for its worst case; or traffic, from a candump log, an MCAP recording (all parts of a split one) or
+    /// live buses. - is standard input: a skin if --table, --format or --computation is given, else
     /// traffic
     #[arg(value_name = "SKIN|FILE|BUS", required = true)]
     sources: Vec<PathBuf>,

@@ -55,7 +55,7 @@ struct GenerateCommand {
     /// Rate of joint broadcasts in Hz; must divide the 500 Hz of the control loop
     #[arg(long, default_value_t = 62.5)]
     broadcast_hz: f64,
-    /// What the cells reply to joint broadcasts
+    /// Reply of the cells to joint broadcasts
     #[arg(long, value_parser = one_of_values(REPLIES), default_value = "torque")]
     reply: Answers,
     /// Frame format of the cells' packets

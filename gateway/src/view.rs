@@ -55,8 +55,8 @@ const DEFAULT_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHO
   skinbus view run.log --skin skin.toml
   skinbus view skin.toml --listen 0.0.0.0:8100 --token-file token --read-only")]
 pub(crate) struct ViewCommand {
-    /// What to show: a skin file, for all its live buses; names of some of its buses, with --skin; or a candump log or
-    /// MCAP recording (all parts of a split one, in any order)
+    /// Skin file, for all its live buses; names of some of its buses, with --skin; or a candump log or MCAP recording
+    /// (all parts of a split one, in any order)
     #[arg(required = true, value_name = "SKIN|BUS|FILE")]
     sources: Vec<PathBuf>,
     /// Skin file of the buses, or of a recording [default: the skin in the recording]

@@ -82,7 +82,7 @@ pub struct ReplayOptions {
     pub files: Vec<PathBuf>,
     /// Kind of each bus.
     pub kinds: KindChoices,
-    /// Whether frames take time on the embedded buses that the replay serves for its cells.
+    /// Time that frames take on the embedded buses that the replay serves for its cells.
     pub bus_time: BusTimeChoice,
     /// Selection of the frames by their sender.
     pub only: SenderFilter,

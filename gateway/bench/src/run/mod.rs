@@ -57,7 +57,7 @@ pub struct RunOptions {
     pub kinds: KindChoices,
     /// Directory of embedded buses; `None` for the usual one.
     pub directory: Option<PathBuf>,
-    /// Whether frames take time on embedded buses.
+    /// Time that frames take on embedded buses.
     pub bus_time: BusTimeChoice,
     /// True if the run starts the cells; otherwise they must be on the bus already.
     pub spawn: bool,
