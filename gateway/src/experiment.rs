@@ -16,11 +16,11 @@ use bench::bus::realtime;
 use bench::record::facts;
 use clap::Args;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use model::quantiles::Quantiles;
 use paper::arm::ReplyMode;
 use paper::moving::BenchRun;
 use paper::scale::ScaleBench;
 use paper::{Effort, Experiment as Named, ExperimentLab, Session, files};
+use protocol::quantiles::Quantiles;
 use protocol::usage::{Failure, print_text, shell_quoted_os};
 use serde_json::Value;
 

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 use std::fmt::Display;
 
 use comfy_table::{Cell, CellAlignment, Color, ColumnConstraint, ContentArrangement, Table, Width, presets};
-use model::quantiles::Quantiles;
+use protocol::quantiles::Quantiles;
 use protocol::usage::{Failure, printable, printable_lines};
 use serde::Serialize;
 

@@ -6,6 +6,8 @@ pub mod bus;
 #[cfg(feature = "host")]
 pub mod packets;
 #[cfg(feature = "host")]
+pub mod quantiles;
+#[cfg(feature = "host")]
 mod shell;
 #[cfg(feature = "host")]
 mod skin_file;

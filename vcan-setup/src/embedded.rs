@@ -24,7 +24,7 @@ mod totals;
 pub use place::BusSocketError;
 pub use served::ServerThread;
 pub use server::{ServeError, Server};
-pub use timed::{BusRecord, DelayQuantiles, TimedBusOptions, TimedReport};
+pub use timed::{BusRecord, TimedBusOptions, TimedReport};
 pub use totals::BusTotals;
 
 #[cfg(test)]

@@ -10,8 +10,8 @@
 use std::io;
 use std::os::fd::OwnedFd;
 
-use model::quantiles::Quantiles;
 use model::scenario::ProcessAction;
+use protocol::quantiles::Quantiles;
 use rustix::io::{Errno, ioctl_fionbio, read, write};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};

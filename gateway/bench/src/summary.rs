@@ -14,8 +14,8 @@ pub use self::outcome::{CellError, ErrorCells, HaltSummary, Outcome, TickSummary
 pub use self::uplink::UplinkSummary;
 pub(crate) use self::verdict::count_noun;
 pub use self::verdict::{MAX_CELL_ERROR_NM, Verdict};
-use model::quantiles::Quantiles;
 use model::table::{BusTable, CellStatus, Contributions, FrameEvent, SumCounts, TorqueAccuracy};
+use protocol::quantiles::Quantiles;
 pub use trace::recording::account::{RecordingAccount, WrittenFile};
 pub use vcan_setup::embedded::TimedReport;
 

@@ -23,7 +23,6 @@ pub mod generate;
 pub mod latched;
 pub mod listing;
 pub mod network;
-pub mod quantiles;
 pub mod repeat;
 pub mod scenario;
 pub mod surface;

@@ -8,7 +8,7 @@ use analysis::compare::{
     COMPARED_ASPECTS, CaptureFigures, CaptureSide, CompareReport, ComparedCellRow, FirstDifference,
     PerCapture, ReplyCounts,
 };
-use model::quantiles::Quantiles;
+use protocol::quantiles::Quantiles;
 use protocol::usage::printable;
 
 use crate::junit::{Outcome, TestCase, TestSuite};

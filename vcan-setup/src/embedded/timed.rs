@@ -26,7 +26,7 @@ mod report;
 pub(super) use clock::BusClock;
 pub use record::BusRecord;
 use report::Counts;
-pub use report::{DelayQuantiles, TimedReport};
+pub use report::TimedReport;
 
 /// Time for which the end of a frame may be delivered late while others wait, so that one wake-up delivers several, in
 /// ns.

@@ -1,7 +1,7 @@
 //! Adds up the results of a comparison over all epochs and cells, into its report.
 
-use model::quantiles::Quantiles;
 use protocol::id::CellId;
+use protocol::quantiles::Quantiles;
 
 use super::numbering::JointsKey;
 use super::report::{CaptureFigures, CellLosses, CompareReport, ComparedCellRow, ExtraCell, ReplyCounts};

@@ -1,6 +1,6 @@
 //! The outcome of a comparison, as printed by `skinbus compare --json`.
 
-use model::quantiles::Quantiles;
+use protocol::quantiles::Quantiles;
 use serde::Serialize;
 
 use super::PerCapture;

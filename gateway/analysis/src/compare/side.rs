@@ -2,11 +2,11 @@
 
 use std::collections::VecDeque;
 
-use model::quantiles::TimeHistogram;
 use model::tracker::{CellTracker, MAX_LATE_EPOCHS, PerCell};
 use protocol::id::CellId;
 use protocol::message::{Joints, Message};
 use protocol::packet::{Epoch, Words};
+use protocol::quantiles::TimeHistogram;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 

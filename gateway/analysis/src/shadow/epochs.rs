@@ -1,8 +1,8 @@
 //! Counts the cells that answered each epoch's joints, and measures the times of their replies.
 
-use model::quantiles::TimeHistogram;
 use protocol::id::CellId;
 use protocol::packet::Epoch;
+use protocol::quantiles::TimeHistogram;
 
 use super::report::{AnsweringCounts, DelayQuantiles, ReplyStatistics};
 use bus_model::traffic::RunEvent;

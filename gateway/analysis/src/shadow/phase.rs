@@ -1,7 +1,7 @@
 //! Splits the traffic of a bus into start-up and operation, and keeps the figures of each phase.
 
-use model::quantiles::TimeHistogram;
 use protocol::id::{Id, Kind};
+use protocol::quantiles::TimeHistogram;
 
 use super::load::{BusyTime, LoadWindow};
 use super::report::{DelayQuantiles, KindDelays, Loads, Peak, StartUpFigures};

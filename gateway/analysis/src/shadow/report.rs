@@ -1,6 +1,6 @@
 //! The figures of a timing model: loads, delays, replies and queues of each bus.
 
-use model::quantiles::TimeHistogram;
+use protocol::quantiles::{Quantiles, TimeHistogram};
 use protocol::wire_time::BitRates;
 use serde::{Serialize, Serializer};
 
@@ -220,10 +220,8 @@ pub struct ReplyStatistics {
 
 impl DelayQuantiles {
     pub(super) fn from_times(times: &TimeHistogram) -> Self {
-        let (histogram, most) = (times.histogram(), times.longest_ns());
-        let micros = |nanos: u64| nanos as f64 / 1e3;
-        let quantile = |share| micros(histogram.value_at_quantile(share).min(most));
-        Self { count: histogram.len(), p50: quantile(0.5), p99: quantile(0.99), max: micros(most) }
+        let Quantiles { p50, p99, max, count, .. } = times.quantiles();
+        Self { count, p50, p99, max }
     }
 }
 

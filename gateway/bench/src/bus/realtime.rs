@@ -14,7 +14,7 @@ use rustix::time::{Timespec, clock_gettime};
 use crate::system_calls;
 use control::cycle::Tick;
 use control::cycle::turn::{SharedRunState, TickDriver};
-use model::quantiles::histogram;
+use protocol::quantiles::histogram;
 
 /// Priority of the control loop: above ordinary threads, below the kernel's own.
 const CONTROL_LOOP_PRIORITY: i32 = 40;

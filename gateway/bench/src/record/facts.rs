@@ -10,7 +10,7 @@ use rustix::thread::ClockId;
 use rustix::time::{clock_getres, clock_gettime};
 
 use model::decode::parameter::ParameterWords;
-use model::quantiles::Quantiles;
+use protocol::quantiles::Quantiles;
 
 /// Metadata values by key.
 pub type Metadata = BTreeMap<String, String>;

@@ -16,7 +16,7 @@ use serde::Serialize;
 
 use super::ReplayError;
 use super::replay_plan::{AwaitedJoints, DueFrame, FrameRole, PlayerStep};
-use model::quantiles::histogram;
+use protocol::quantiles::histogram;
 
 /// Time in ns from the decision to start to the first frame.
 const START_DELAY_NS: u64 = 1_000_000;

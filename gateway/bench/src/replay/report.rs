@@ -10,7 +10,7 @@ use super::comparator::{ReplyTally, UncomparedReplies};
 use super::difference::Difference;
 use super::player::BusTally;
 use crate::summary::{CellError, cells_in_error, count_noun};
-use model::quantiles::Quantiles;
+use protocol::quantiles::Quantiles;
 
 /// Summary of a replay.
 #[derive(Clone, Debug, Serialize)]

@@ -26,7 +26,7 @@ use crate::error::RunError;
 use crate::processes::ended::EndedProcesses;
 use crate::progress::Progress;
 use crate::threads::spawn;
-use model::quantiles::Quantiles;
+use protocol::quantiles::Quantiles;
 
 /// Interval between two checks of the main thread.
 const CHECK_INTERVAL: Duration = Duration::from_millis(20);

@@ -20,8 +20,8 @@ use crate::summary::{
     BusSummary, CellSummary, LoopSummary, NetworkSummary, OutagesSummary, Summary, TimedReport,
 };
 use crate::view::BusView;
-use model::quantiles::Quantiles;
 use model::table::{ResponseFlags, TorqueAccuracy};
+use protocol::quantiles::Quantiles;
 use trace::recording::account::RecordingAccount;
 
 /// Time that cells have to send their final reports; an overloaded machine needs it.

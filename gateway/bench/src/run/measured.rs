@@ -13,8 +13,8 @@ use super::status_line::StatusLine;
 use crate::remote::TickLateness;
 use control::cycle::turn::TimedRecord;
 use model::accelerometer::RobotState;
-use model::quantiles::{Quantiles, histogram};
 use model::scenario::TorqueSource;
+use protocol::quantiles::{Quantiles, histogram};
 
 /// Totals over the tick records of the control loop.
 #[derive(Debug)]

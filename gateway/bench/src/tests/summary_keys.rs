@@ -8,7 +8,6 @@ use crate::summary::{
     Outcome, PrivateMemory, ProcessorUse, RecordingAccount, RepliesSummary, Summary, SumsSummary,
     TickSummary, TimedReport, Verdict, WrittenFile,
 };
-use model::quantiles::{Quantiles, histogram};
 use model::table::{BusTable, CellStatus, FrameEvent, TorqueAccuracy};
 use protocol::can::Format;
 use protocol::fixed::{Q3_12, Q5_10};
@@ -18,6 +17,7 @@ use protocol::message::{
 };
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::Parameter;
+use protocol::quantiles::{Quantiles, histogram};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 use serde_json::Value;

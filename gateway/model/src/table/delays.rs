@@ -3,7 +3,7 @@
 use hdrhistogram::Histogram;
 use protocol::time::Span;
 
-use crate::quantiles::histogram;
+use protocol::quantiles::histogram;
 
 /// Delays of the cells of a bus in µs, from the time stamps of frames.
 #[derive(Clone, Debug)]

@@ -4,7 +4,7 @@ use bench::summary::{
     LoopSummary, OutagesSummary, PrivateMemory, RecordingAccount, RepliesSummary, UplinkSummary, Verdict,
     WrittenFile,
 };
-use model::quantiles::Quantiles;
+use protocol::quantiles::Quantiles;
 
 use super::*;
 

@@ -1,6 +1,6 @@
 //! Events of a run, one JSON object a line. `docs/reference/control.md` describes them.
 
-use model::quantiles::Quantiles;
+use protocol::quantiles::Quantiles;
 use serde::Serialize;
 use serde_json::Value;
 

@@ -3,27 +3,12 @@
 use std::collections::BTreeMap;
 
 use bus_model::TransmitQueue;
-use hdrhistogram::Histogram;
+use protocol::quantiles::{Quantiles, TimeHistogram};
 use protocol::wire_time::BitRates;
 use serde::{Deserialize, Serialize};
 
 /// Delay of a delivery after the end of its frame from which the server counts as behind, in ns.
 const BEHIND_NS: u64 = 1_000_000;
-
-/// Quantiles of times in µs.
-#[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq, Serialize)]
-pub struct DelayQuantiles {
-    /// Median.
-    pub p50: f64,
-    /// 90th percentile.
-    pub p90: f64,
-    /// 99th percentile.
-    pub p99: f64,
-    /// Maximum.
-    pub max: f64,
-    /// Number of values.
-    pub count: u64,
-}
 
 /// The figures of a timed bus since its start.
 #[derive(Clone, Debug, Default, Deserialize, PartialEq, Serialize)]
@@ -56,9 +41,9 @@ pub struct TimedReport {
     /// second joints.
     pub load: Option<f64>,
     /// Time from a request to the end of the frame.
-    pub wait_us: DelayQuantiles,
+    pub wait_us: Quantiles,
     /// Time from the end of a frame to its delivery to the last client.
-    pub delay_us: DelayQuantiles,
+    pub delay_us: Quantiles,
     /// Number of times that the server fell behind: it delivered frames more than 1 ms after their ends.
     pub behind: u64,
     /// Refused frames by identifier, with the flags of `can_id`, in hexadecimal.
@@ -70,7 +55,7 @@ pub struct TimedReport {
 }
 
 /// The counters of a timed bus.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct Counts {
     pub(super) requested: u64,
     pub(super) sent: u64,
@@ -80,59 +65,10 @@ pub(super) struct Counts {
     refused_by_id: BTreeMap<u32, u64>,
     /// End and busy time before it, of the first and the last joints.
     joints: Option<[(u64, u64); 2]>,
-    pub(super) waits: Times,
-    delays: Times,
+    pub(super) waits: TimeHistogram,
+    delays: TimeHistogram,
     is_behind: bool,
     behind: u64,
-}
-
-/// Times in ns.
-#[derive(Debug)]
-pub(super) struct Times {
-    histogram: Histogram<u64>,
-    longest: u64,
-}
-
-impl Times {
-    fn new() -> Self {
-        let histogram = Histogram::new(3).expect("three digits are a valid precision");
-        Self { histogram, longest: 0 }
-    }
-
-    pub(super) fn record(&mut self, nanos: u64) {
-        // Recording cannot fail: the histogram resizes itself.
-        let _ = self.histogram.record(nanos);
-        self.longest = self.longest.max(nanos);
-    }
-
-    fn quantiles(&self) -> DelayQuantiles {
-        let at = |share| to_f64(self.histogram.value_at_quantile(share)) / 1e3;
-        DelayQuantiles {
-            p50: at(0.5),
-            p90: at(0.9),
-            p99: at(0.99),
-            max: to_f64(self.longest) / 1e3,
-            count: self.histogram.len(),
-        }
-    }
-}
-
-impl Default for Counts {
-    fn default() -> Self {
-        Self {
-            requested: 0,
-            sent: 0,
-            damaged: 0,
-            beside: 0,
-            busy_ns: 0,
-            refused_by_id: BTreeMap::new(),
-            joints: None,
-            waits: Times::new(),
-            delays: Times::new(),
-            is_behind: false,
-            behind: 0,
-        }
-    }
 }
 
 impl Counts {

@@ -1,7 +1,7 @@
 //! Series from the ticks of a recording: joints, torques, the loop's timing.
 
 use crate::report::thin::ThinnedLine;
-use model::quantiles::TimeHistogram;
+use protocol::quantiles::TimeHistogram;
 use trace::ros2::read::{Joints, Torques};
 use trace::ros2::skin::LoopTiming;
 

@@ -10,9 +10,9 @@ use crate::report::figure::{
     Axis, Figure, LowerDiagram, MarkLine, Section, SeriesShape, Table, format_quantity,
 };
 use crate::report::thin::ThinnedLine;
-use model::quantiles::Quantiles;
 use model::table::{TorqueAccuracy, TorqueErrors};
 use protocol::fixed::TorqueFormat;
+use protocol::quantiles::Quantiles;
 use protocol::skin::{JointKind, SkinReply};
 
 /// Upper bound of the central computation's rounding error, in Nm: smaller errors count as zero.

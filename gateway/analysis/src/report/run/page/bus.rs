@@ -10,8 +10,8 @@ use crate::report::figure::{
 use crate::report::svg::stair_points;
 use crate::report::thin::{BinnedSums, ThinnedLine};
 use crate::shadow::BusShadow;
-use model::quantiles::Quantiles;
 use model::table::{CellState, FrameEvent};
+use protocol::quantiles::Quantiles;
 
 /// Maximum number of cells in the table of the cells with most problems.
 const MAX_WORST_CELLS: usize = 12;

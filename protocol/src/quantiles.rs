@@ -37,10 +37,18 @@ impl TimeHistogram {
         &self.histogram
     }
 
-    /// Returns the longest time in ns; 0 if empty.
+    /// Returns the quantiles in µs. The maximum is exact, and no quantile exceeds it.
     #[must_use]
-    pub const fn longest_ns(&self) -> u64 {
-        self.longest
+    #[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
+    pub fn quantiles(&self) -> Quantiles {
+        let at = |share| self.histogram.value_at_quantile(share).min(self.longest) as f64 / 1e3;
+        Quantiles {
+            p50: at(0.5),
+            p90: at(0.9),
+            p99: at(0.99),
+            max: self.longest as f64 / 1e3,
+            count: self.histogram.len(),
+        }
     }
 }
 
