@@ -77,7 +77,7 @@ pub(crate) struct CompareCommand {
     /// Print one JSON object instead of the table
     #[arg(long, short)]
     json: bool,
-    /// Also write a JUnit report, with a test case for each aspect
+    /// Also write a JUnit report, with a test case for each compared aspect: epochs, joints, halts, contacts, torques, sums, cells
     #[arg(long, value_name = "FILE")]
     junit: Option<PathBuf>,
     #[command(flatten)]

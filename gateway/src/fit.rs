@@ -6,7 +6,7 @@ mod traffic;
 
 use std::path::{Path, PathBuf};
 
-use clap::Args;
+use clap::{Args, ValueEnum};
 use protocol::can::Format;
 use protocol::input::can_be_read_again;
 use protocol::usage::Failure;
@@ -68,6 +68,9 @@ pub(crate) struct FitCommand {
     /// wires)
     #[arg(long)]
     bench_traffic: bool,
+    /// With traffic: meaning of the time stamps of frames [default: request; end if the bus or the recording says so]
+    #[arg(long, value_enum, value_name = "MEANING")]
+    time_stamps: Option<TimeStamps>,
     /// With traffic: assumed bit error rate, 0 to 0.01 [default: 0]; each damaged frame causes an error frame and a
     /// retransmission
     #[arg(long, value_name = "SHARE", allow_negative_numbers = true)]
@@ -78,16 +81,25 @@ pub(crate) struct FitCommand {
     /// With live buses: end the measurement after this time
     #[arg(long, value_name = "TIME", value_parser = parse_duration, allow_negative_numbers = true)]
     duration: Option<f64>,
-    /// Print one JSON object; for traffic, one per frame instead of tables, in the order of the file
+    /// Print JSON instead of tables: one object for a skin, one for each frame of traffic
     ///
-    /// Keys of a frame: time, start_s, end_s (s on the clock of the capture), bus, id (as candump prints it),
-    /// nominal_bits and data_bits (including stuff bits and intermission). Frames left out have null bits and null
-    /// times; frames that were never sent have null times. time_is is "end" if time is the end of the frame on a timed
-    /// bus, else missing.
+    /// Keys of a frame: bus; id, as candump prints it; time, its time stamp; start_s and end_s, its computed start and
+    /// end (all in s, on the clock of the capture); nominal_bits and data_bits, including stuff bits and intermission;
+    /// time_is, which is "end" if the time stamp is the end of the frame, and absent otherwise. Frames that are not
+    /// counted have null for bits, start_s and end_s; frames that could not be sent, for start_s and end_s.
     #[arg(long, short)]
     json: bool,
     #[command(flatten)]
     kinds: BusKinds,
+}
+
+/// Meaning of the time stamps of frames.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum TimeStamps {
+    /// The frame is requested at this time, as on a bus where frames take no time: computes when it would be sent
+    Request,
+    /// The frame has ended at this time, as in a capture of a real bus: computes the load, but no queueing
+    End,
 }
 
 impl FitCommand {
@@ -97,6 +109,7 @@ impl FitCommand {
             ("--rates", !self.rates.is_empty()),
             ("--skin", self.skin.is_some()),
             ("--bench-traffic", self.bench_traffic),
+            ("--time-stamps", self.time_stamps.is_some()),
             ("--ber", self.ber.is_some()),
             ("--duration", self.duration.is_some()),
         ];

@@ -89,9 +89,12 @@ pub(crate) fn format_decimals(value: Option<f64>, decimals: usize, none: &str) -
     or_else_text(value.map(|value| format!("{value:.decimals$}")), none)
 }
 
-/// Formats the quantiles 50 %, 90 % and 99 %, and the maximum.
+/// Formats the quantiles 50 %, 90 % and 99 %, and the maximum, or says that nothing was measured.
 pub(crate) fn format_quantiles(quantiles: &Quantiles) -> String {
-    let Quantiles { p50, p90, p99, max, .. } = quantiles;
+    let Quantiles { p50, p90, p99, max, count } = quantiles;
+    if *count == 0 {
+        return "none".to_owned();
+    }
     format!("{p50:.0} / {p90:.0} / {p99:.0} / {max:.0}")
 }
 

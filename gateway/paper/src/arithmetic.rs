@@ -86,7 +86,7 @@ pub fn sine_section() -> Section {
             ),
             figure("sine-max", "Maximum error in each of 256 parts of the circle", "maximum error")
                 .draw_series("fifth order", SeriesShape::Steps, fifth.parts.clone())
-                .draw_series("by eighths of a turn, used by the cells", SeriesShape::Steps, eighths.parts.clone())
+                .draw_series("polynomials of the cells (one for each eighth of a turn)", SeriesShape::Steps, eighths.parts.clone())
                 .draw_series("rounding alone", SeriesShape::Steps, rounded.parts.clone()),
         ])
         .with_findings([

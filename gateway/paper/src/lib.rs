@@ -87,7 +87,7 @@ impl Experiment {
         match self {
             Self::Fig6 => (
                 "fig6",
-                "torques of the moving arm, computed on the cells and in the loop; errors in Q3.12 and Q7.8",
+                "joint torques of the moving arm, as the cells compute them in Q3.12 and Q7.8, beside those of the control loop",
                 [10, 32],
             ),
             Self::Fig7 => ("fig7", "joint velocities and active cells of the moving arm", [1, 1]),

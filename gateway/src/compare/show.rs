@@ -101,7 +101,7 @@ impl ComparisonText<'_> {
             ("  missing", epochs.missing_in_a, epochs.missing_in_b, "present in the other run"),
             ("  before the other", epochs.before.only_a, epochs.before.only_b, "not compared"),
             ("  after the other", epochs.after.only_a, epochs.after.only_b, "not compared"),
-            ("  halted", halts.only_a, halts.only_b, "while the other was not"),
+            ("  halted", halts.only_a, halts.only_b, "only one of the two was halted"),
         ] {
             if a + b > 0 {
                 row(name, a.to_string(), b.to_string(), both.to_owned());

@@ -124,7 +124,7 @@ fn format_one_line_per_cell(cells: &[CellExplanation], is_finest: bool) -> Strin
     let joints = |cell: &CellExplanation| cell.rows.iter().map(|row| row.joint).collect::<Vec<_>>();
     let tables = cells.chunk_by(|one, other| joints(one) == joints(other)).map(format_torques);
     format!(
-        "\ntorques of the cells{unit}, with the largest difference in steps of {steps}; --cell shows the whole computation\n{}",
+        "\ntorque of each cell about each joint{unit}; 'steps': largest difference from the recomputed torque, in steps of {steps}. Use --cell to see a cell's whole computation\n{}",
         tables.collect::<String>()
     )
 }

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use analysis::fit::rates::RequestedRates;
-use analysis::shadow::{self, Shadow};
+use analysis::shadow::{self, Shadow, StampedAtEnd};
 use protocol::bus::{BusError, BusOptions};
 use protocol::skin::Skin;
 use protocol::stop::{self, InterruptibleWriter};
@@ -15,7 +15,7 @@ use protocol::usage::{Failure, ignore_broken_pipe, print_text};
 use trace::capture::{CaptureEntry, NoteKind, Reader};
 
 use self::show::write_frames;
-use super::FitCommand;
+use super::{FitCommand, TimeStamps};
 use crate::input::{
     self, BusReceiver, LossCounts, POLL_TIMEOUT, is_file, location, no_frame_failure, note_skin_difference,
     open_capture, skin_found_so_far, stop_flag,
@@ -61,8 +61,13 @@ impl FitCommand {
             (shadow, taken)
         } else {
             let stopped = stop_flag()?;
-            let mut shadow = self.create_shadow(skin, Vec::new())?;
-            let taken = self.receive_live_traffic(&mut shadow, &mut out, &stopped)?;
+            let kinds = self.kinds.kinds_of_any_buses()?;
+            let options = BusOptions { receive_buffer: RECEIVE_BUFFER_BYTES, ..BusOptions::default() };
+            let receive_ends = input::open_bus_receivers(&self.sources, &kinds, None, &options, None)?;
+            let buses = receive_ends.iter().map(BusReceiver::bus).filter(|bus| bus.is_timed());
+            let timed_buses = buses.map(|bus| bus.name().to_owned()).collect();
+            let mut shadow = self.create_shadow(skin, timed_buses)?;
+            let taken = self.receive_live_traffic(receive_ends, &mut shadow, &mut out, &stopped)?;
             (shadow, taken)
         };
         shadow.finish();
@@ -124,7 +129,11 @@ impl FitCommand {
             seed: self.seed.unwrap_or(1),
             each_frame: self.json,
             bench_traffic: self.bench_traffic,
-            timed_buses,
+            stamped_at_end: match self.time_stamps {
+                Some(TimeStamps::End) => StampedAtEnd::All,
+                Some(TimeStamps::Request) => StampedAtEnd::default(),
+                None => StampedAtEnd::Named(timed_buses),
+            },
             skin,
             ..shadow::ShadowOptions::new(requested.rates().map_err(Failure::usage_error)?)
         };
@@ -134,13 +143,11 @@ impl FitCommand {
     /// Receives from buses until a signal, and passes the frames to the model.
     fn receive_live_traffic(
         &self,
+        mut receive_ends: Vec<BusReceiver>,
         shadow: &mut Shadow,
         out: &mut impl Write,
         stopped: &AtomicBool,
     ) -> Result<TrafficInput, Failure> {
-        let kinds = self.kinds.kinds_of_any_buses()?;
-        let options = BusOptions { receive_buffer: RECEIVE_BUFFER_BYTES, ..BusOptions::default() };
-        let mut receive_ends = input::open_bus_receivers(&self.sources, &kinds, None, &options, None)?;
         let length = self.duration.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
         let end = length.map(|length| Instant::now() + length);
         let mut ended = Ok(());

@@ -134,7 +134,7 @@ fn add_accuracy_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bo
         if is_verbose {
             let errors = &accuracy.unquantised;
             rows.add_row(
-                "  with unrounded parameters",
+                "  against unrounded parameters",
                 format_mean_and_max(errors),
                 format_torque_count(errors),
             );
@@ -190,9 +190,9 @@ fn add_control_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: boo
     if is_verbose && control.central_us.count > 0 {
         rows.add_row("tick duration", format_quantiles(&control.took_us), "");
         rows.add_row(
-            "  central computation in it",
+            "  of which central computation",
             format_quantiles(&control.central_us),
-            "none in distributed mode",
+            "0 in distributed mode",
         );
     }
     if is_verbose && control.took_distributed_us.count > 0 {
@@ -301,7 +301,11 @@ fn add_reply_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) 
         let name = format!("{last} after broadcast, µs");
         rows.add_row(name, format_quantiles(&bus.last_reply_us), "by kernel time stamps");
         if bus.sums.is_none() {
-            rows.add_row("  each reply, µs", format_quantiles(&bus.reply_us), "including late replies");
+            rows.add_row(
+                "  each reply after broadcast, µs",
+                format_quantiles(&bus.reply_us),
+                "including late replies",
+            );
         }
         add_joint_age_row(rows, bus);
     } else if bus.last_reply_us.count > 0 {
@@ -385,8 +389,8 @@ fn add_due_rows(
 
 /// Adds a row on the age of joints that cells have not received.
 fn add_joint_age_row(rows: &mut KeyValueTable, bus: &BusSummary) {
-    let why = "a large age means a busy machine or lost frames";
-    rows.add_row("age of missed joints, µs", format_quantiles(&bus.joints_not_taken_us), why);
+    let why = "large: a busy machine, or lost frames";
+    rows.add_row("age of joints missed by cells, µs", format_quantiles(&bus.joints_not_taken_us), why);
 }
 
 /// Converts a key of the summary to words.
@@ -463,7 +467,7 @@ fn add_cost_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) 
             rows.add_row("private memory of a cell process", format!("{kib} KiB"), "the largest");
         }
         if let Some(kib) = summary.memory.gateway_private_kib {
-            let buses = summary.memory.buses_private_kib.map(|kib| format!("its bus servers {kib} KiB"));
+            let buses = summary.memory.buses_private_kib.map(|kib| format!("of which bus servers {kib} KiB"));
             rows.add_row("private memory of the gateway", format!("{kib} KiB"), buses.unwrap_or_default());
         }
         rows.add_row("start to first broadcast", format!("{:.2} s", summary.first_broadcast_s), "");

@@ -42,6 +42,8 @@ fn frames_are_stamped_with_their_ends_and_refused_when_the_queue_is_full() {
     let server = serve(&place, &format!("--rates {RATES} --queue fifo:3 --record record.txt"));
     let (sender, listener) = (open(&place), open(&place));
     assert!(sender.is_timed() && listener.is_timed());
+    let fit = place.start("skinbus", "fit vcan0 --bus-kind embedded");
+    fit.wait_for_stderr("vcan0: bus of kind embedded");
     // A program of version 2 gets the same frames without stamps.
     let older = seqpacket_socket(SocketFlags::empty()).unwrap();
     rustix::net::connect(&older, &socket_address(&place.buses(), "vcan0").unwrap()).unwrap();
@@ -68,6 +70,10 @@ fn frames_are_stamped_with_their_ends_and_refused_when_the_queue_is_full() {
         }
         inbox.frames().any(|received| received.frame.id() == 0x7FF).then_some(())
     });
+    // The time stamps of a live bus are known to be ends, too.
+    fit.signal(Signal::INT);
+    let live = fit.end();
+    assert!(live.stdout.contains("ends of frames"), "{live:#?}");
     server.signal(Signal::TERM);
     let ended = server.end();
     assert_eq!(ended.code(), Some(0));
@@ -144,7 +150,7 @@ fn a_run_on_a_timed_bus_accounts_for_each_reply() {
         ),
     );
     place.scenario(PRESSED);
-    place.bench(2.0, "").end().succeeded();
+    place.bench(2.0, "--record run.mcap").end().succeeded();
     let summary = place.summary();
     summary.adds_up();
     let timed = &summary.0["buses"][0]["timed"];
@@ -155,6 +161,21 @@ fn a_run_on_a_timed_bus_accounts_for_each_reply() {
     assert_eq!(timed["sent"], timed["requested"], "{timed}");
     assert_eq!((timed["refused"].as_u64(), timed["waiting"].as_u64()), (Some(0), Some(0)), "{timed}");
     assert!(timed["beside"].as_u64() > Some(0) && timed["load"].as_f64() > Some(0.0), "{timed}");
+    // The report says it, and shows the latest reply beside the bound.
+    place.start("skinbus", "report run.mcap -o report.html").end().succeeded();
+    let report = place.read("report.html");
+    assert!(report.contains("On vcan0 each frame took the time of its bits"), "{report}");
+    assert!(report.contains("worst case of skinbus fit"), "{report}");
+    let stamps = |words: &str| {
+        let ended = place.start("skinbus", words).end().succeeded();
+        ended.stdout.contains("ends of frames")
+    };
+    assert!(stamps("fit run.mcap"));
+    assert!(!stamps("fit run.mcap --time-stamps request"));
+    // A log cannot say it.
+    assert!(stamps("fit run.log --time-stamps end") && !stamps("fit run.log"));
+    let refused = place.start("skinbus", "fit skin.toml --time-stamps end").end();
+    assert!(refused.refusal(2).contains("--time-stamps is only for frames of"), "{}", refused.stderr);
     // The option goes before the skin.
     place.bench(1.0, "--bus-time none").end().succeeded();
     assert!(place.summary().0["buses"][0]["timed"].is_null());

@@ -63,10 +63,25 @@ pub struct ShadowOptions {
     pub each_frame: bool,
     /// True to include frames that only a bench sends.
     pub bench_traffic: bool,
-    /// The names of buses whose time stamps are the ends of frames on a timed bus. No queueing is modelled for them.
-    pub timed_buses: Vec<String>,
+    /// The buses whose time stamps are the ends of frames. No queueing is modelled for them.
+    pub stamped_at_end: StampedAtEnd,
     /// The skin, from which the worst case is computed for comparison with the capture.
     pub skin: Option<Skin>,
+}
+
+/// Buses whose time stamps are the ends of frames, as on a timed or a real bus.
+#[derive(Clone, Debug)]
+pub enum StampedAtEnd {
+    /// These buses.
+    Named(Vec<String>),
+    /// All buses.
+    All,
+}
+
+impl Default for StampedAtEnd {
+    fn default() -> Self {
+        Self::Named(Vec::new())
+    }
 }
 
 impl ShadowOptions {
@@ -80,7 +95,7 @@ impl ShadowOptions {
             seed: 1,
             each_frame: false,
             bench_traffic: false,
-            timed_buses: Vec::new(),
+            stamped_at_end: StampedAtEnd::Named(Vec::new()),
             skin: None,
         }
     }
@@ -93,7 +108,10 @@ impl ShadowOptions {
             described.map(|(skin, bus)| u32::try_from(skin.cells_on_bus(bus).count()).unwrap_or(u32::MAX));
         let worst_case = described.and_then(|(skin, bus)| fit::assess_worst_case(skin, bus, rates));
         let worst_case = worst_case.as_ref().map(FitSummary::worst_case);
-        let is_timed = self.timed_buses.iter().any(|name| name == bus);
+        let is_timed = match &self.stamped_at_end {
+            StampedAtEnd::All => true,
+            StampedAtEnd::Named(buses) => buses.iter().any(|name| name == bus),
+        };
         BusProperties { rates, cells, worst_case, bench_traffic: self.bench_traffic, is_timed }
     }
 }

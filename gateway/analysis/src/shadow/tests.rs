@@ -221,8 +221,11 @@ fn nothing_is_nothing() {
 
 #[test]
 fn time_stamps_of_a_timed_bus_are_the_ends_of_its_frames() {
-    let mut timed =
-        Shadow::new(ShadowOptions { timed_buses: vec!["vcan0".to_owned()], ..options() }).unwrap();
+    let mut timed = Shadow::new(ShadowOptions {
+        stamped_at_end: StampedAtEnd::Named(vec!["vcan0".to_owned()]),
+        ..options()
+    })
+    .unwrap();
     for epoch in 0..40 {
         let at = u64::from(epoch) * 16 * MS + MS;
         let mut send = |mut end: u64, messages: &[Message]| {

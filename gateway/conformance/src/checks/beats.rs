@@ -156,8 +156,9 @@ fn check_heartbeats_not_shifted(session: &mut Session<'_>) -> Result<(), StopRea
                 session.check("BEAT-3", is_so, || {
                     let times = format_ms(times.iter().map(|at| at - grid.0));
                     format!(
-                        "when {what} arrives {offset} ms after a regular heartbeat, further heartbeats must \
-                         follow {offset}, 250 and 500 ms after the first, but they followed after {times} ms"
+                        "{what} {offset} ms after a regular heartbeat must be answered with a heartbeat at once, \
+                         and must not shift the regular ones 250 and 500 ms after it; the cell sent heartbeats \
+                         {times} ms after it"
                     )
                 });
                 break;

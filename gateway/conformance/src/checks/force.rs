@@ -78,8 +78,7 @@ fn check_press(
         )
     };
     session.check(id, is_there == (force > 0), || {
-        let came =
-            if is_there { "the cell sent a torque message" } else { "the cell sent no torque message" };
+        let came = if is_there { "the cell sent a nonzero torque" } else { "the cell sent no torque" };
         format!("with {}, the force F_z must be {force} steps of 2^-16 N, but {came}", sensed())
     });
     if is_there {

@@ -162,9 +162,9 @@ fn check_joint_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
         let id = if is_repeated { "JOINTS-1" } else { "COUNT-1" };
         session.check(id, (repeated, meaning) == (is_repeated.into(), (!is_repeated).into()), || {
             format!(
-                "if a joints message repeats the last epoch, the cell must count it once as repeated if its \
-                 count is 5, and once in the counter 'meaning' if its count is 0, but it counted that with \
-                 count {count} {repeated} times as repeated and {meaning} times in 'meaning'"
+                "a joints message that repeats the last epoch, with the value {count} in its count byte, must \
+                 raise the counter {} by 1; the counter 'repeated' rose by {repeated}, and 'meaning' by {meaning}",
+                if is_repeated { "'repeated'" } else { "'meaning'" }
             )
         });
         before = after;

@@ -110,8 +110,18 @@ fn segment_series(session: &Session<'_>) -> Vec<SegmentSeries> {
             1,
             1,
         ),
-        of("a packet without its second segment, then another", vec![Send(a1), Send(b1), Send(b2)], 1, 1),
-        of("a packet without its first segment, then another", vec![Send(a2), Send(b1), Send(b2)], 1, 1),
+        of(
+            "a packet without its second segment, then a complete packet",
+            vec![Send(a1), Send(b1), Send(b2)],
+            1,
+            1,
+        ),
+        of(
+            "a packet without its first segment, then a complete packet",
+            vec![Send(a2), Send(b1), Send(b2)],
+            1,
+            1,
+        ),
         of("a first segment twice", vec![Send(a1), Send(a1), Send(a2)], 1, 1),
         of(
             "a second segment twice, then a packet",
@@ -187,8 +197,8 @@ fn run_series(session: &mut Session<'_>, series: &SegmentSeries) -> Result<(), S
             after.length == before.length && after.meaning == before.meaning && after.crc == before.crc;
         session.check("COUNT-3", (answers, counted) == expected && others, || {
             format!(
-                "{}: the cell answered {answers} packets and counted {counted} as incomplete, but {} and {} \
-                 were expected",
+                "when it receives {}, the cell must answer {} packets and count {} as incomplete; it answered \
+                 {answers} and counted {counted}",
                 series.what, series.packets, series.incomplete
             )
         });

@@ -238,7 +238,10 @@ fn add_answer_rows(rows: &mut KeyValueTable, replies: &ReplyStatistics) {
 }
 
 fn format_delays(delays: &DelayQuantiles) -> String {
-    let DelayQuantiles { p50, p99, max, .. } = delays;
+    let DelayQuantiles { p50, p99, max, count } = delays;
+    if *count == 0 {
+        return "none".to_owned();
+    }
     format!("{p50:.0} / {p99:.0} / {max:.0}")
 }
 

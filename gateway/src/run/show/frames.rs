@@ -55,7 +55,11 @@ fn add_packet_rows(rows: &mut KeyValueTable, bus: &BusSummary, lost: u64) {
     let up = &bus.uplink;
     rows.add_row("packets sent by cells", up.sent, "according to their own counters");
     rows.add_row("  delivered", up.delivered, format!("{} rejected", up.rejected));
-    rows.add_row_unless_zero("  sums to other cells", up.unheard, "not received by the gateway");
+    rows.add_row_unless_zero(
+        "  sums sent from cell to cell",
+        up.unheard,
+        "the gateway does not listen to them",
+    );
     let reasons = [
         (up.dropped, "dropped by the bus"),
         (up.backlog, "dropped by the kernel's backlog"),

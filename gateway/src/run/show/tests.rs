@@ -140,7 +140,7 @@ fn verbose_has_all_rows() {
     let [brief, verbose] =
         [false, true].map(|is_verbose| format_summary(&demo(), TableStyle { is_verbose, columns, ..EIGHTY }));
     let usual = [
-        "with unrounded parameters",
+        "against unrounded parameters",
         "central computation",
         "broadcasts",
         "SCHED_FIFO",

@@ -76,7 +76,7 @@ impl fmt::Display for RecoveryResult {
         let seconds = (self.last_nanos / 1_000_000_000, self.last_nanos % 1_000_000_000 / 1_000);
         let of = self.stated.filter(|stated| *stated != self.messages);
         let of = of.map_or_else(String::new, |stated| format!(" of {stated}"));
-        write!(f, "{}{of} messages, {} of them frames", self.messages, self.frames)?;
+        write!(f, "{}{of} messages recovered, {} of which are CAN frames", self.messages, self.frames)?;
         if self.messages > 0 {
             write!(f, ", the last at {}.{:06}", seconds.0, seconds.1)?;
         }

@@ -9,7 +9,7 @@ use super::{MAX_JOINTS, MAX_ROWS};
 #[non_exhaustive]
 pub enum ParameterError {
     /// The parameter does not exist, or is not one that is written and stored.
-    #[error("parameter {0} cannot be written")]
+    #[error("parameter {0} does not exist or is read-only")]
     NotWritable(u8),
     /// The number of joints is out of range.
     #[error("{got} joints are not possible; use 1 to {MAX_JOINTS}")]

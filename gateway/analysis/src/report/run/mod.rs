@@ -242,13 +242,14 @@ fn read_recording(
 }
 
 /// Creates the timing model of the real buses for which the load is computed.
-fn create_shadow(skin: &Skin, bus_figures: &[BusFigures]) -> Shadow {
+fn create_shadow(skin: &Skin, bus_figures: &[BusFigures], timed_buses: Vec<String>) -> Shadow {
     let rates = RequestedRates::default().rates().expect("the default rates are valid");
     let of_bus =
         bus_figures.iter().map(|bus_figures| (bus_figures.name.clone(), bus_figures.rates.rates)).collect();
     let options = shadow::ShadowOptions {
         rates_by_bus: of_bus,
         each_frame: true,
+        stamped_at_end: shadow::StampedAtEnd::Named(timed_buses),
         skin: Some(skin.clone()),
         ..shadow::ShadowOptions::new(rates)
     };
@@ -324,7 +325,8 @@ impl RunData {
             Ok(BusFigures::new(&skin, at, rates, frames_only.is_some()))
         });
         let mut bus_figures = bus_figures.collect::<Result<Vec<_>, ReportError>>()?;
-        let mut shadow = create_shadow(&skin, &bus_figures);
+        let timed_buses = extras.timed_buses().map(str::to_owned).collect();
+        let mut shadow = create_shadow(&skin, &bus_figures, timed_buses);
         for before in &extras.latched {
             shadow.receive_latched(&before.bus, before.nanos, &before.frame);
             if let Some(bus_figures) = skin.bus_index(&before.bus).and_then(|bus| bus_figures.get_mut(bus)) {

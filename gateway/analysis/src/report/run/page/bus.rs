@@ -2,6 +2,7 @@
 
 use super::super::bus_figures::{BusFigures, Latency};
 use super::{PageDraft, without_empty_series};
+use crate::fit;
 use crate::fit::limits::MAX_NODES_PER_BUS;
 use crate::fit::verdict::{FitSummary, format_percent};
 use crate::report::figure::{
@@ -65,7 +66,9 @@ impl PageDraft<'_> {
         let mut figures = vec![steps("replies", "replies due and in time, per epoch", y.clone(), due)];
         figures.extend((lost > 0).then(|| steps("late", "late and missing, when detected", y, late)));
         let slowest = self.time_figure(format!("slowest-{name}"), slowest, Axis::new("time", "ms"));
-        let slowest = slowest.with_series([self.thinned_series("", &bus_figures.lines.slowest)]);
+        let slowest = slowest
+            .with_series([self.thinned_series("", &bus_figures.lines.slowest)])
+            .with_marks(self.last_reply_bound(bus_figures));
         figures.push(if lost > 0 { slowest } else { slowest.with_half_width() });
         figures
     }
@@ -183,6 +186,17 @@ impl PageDraft<'_> {
         buses.into_iter().filter(|bus| self.run.skin.bus_index(&bus.bus).is_some())
     }
 
+    /// Returns a line at the latest end of the last reply in the worst case, if frames take time on the bus. `None`
+    /// without such an upper bound.
+    fn last_reply_bound(&self, bus_figures: &BusFigures) -> Option<MarkLine> {
+        self.bus_shadows().find(|bus| bus.bus == bus_figures.name && bus.is_timed)?;
+        let skin = &self.run.skin;
+        let worst =
+            fit::assess_worst_case(skin, skin.bus_index(&bus_figures.name)?, bus_figures.rates.rates)?;
+        let millis = worst.times.last_answer_ns()? as f64 / 1e6;
+        Some(MarkLine::at_y(millis, "worst case of skinbus fit"))
+    }
+
     /// Creates the findings on whether real buses can carry the traffic, in this run and in the worst case. They are
     /// rated only if the bit rates were chosen, not for defaults.
     pub(super) fn fit_findings(&self) -> Vec<Finding> {
@@ -224,13 +238,29 @@ impl PageDraft<'_> {
                 )
                 .with_marks([MarkLine::at_y(100.0, "full load")])
         };
-        let text = "On this bus a frame took no time. On a real bus it takes the time of its bits, including its stuff bits. \
-                    This run is rated by its second with the highest load; the worst case assumes that all cells answer \
+        let (timed, untimed): (Vec<_>, Vec<_>) = self.bus_shadows().partition(|bus| bus.is_timed);
+        let names =
+            |buses: &[BusShadow]| buses.iter().map(|bus| bus.bus.as_str()).collect::<Vec<_>>().join(", ");
+        let mut section = Section::new("load", "Load of the buses");
+        if !untimed.is_empty() {
+            section = section.with_paragraph(format!(
+                "On {} a frame took no time. On a real bus it takes the time of its bits, including its stuff bits.",
+                names(&untimed)
+            ));
+        }
+        if !timed.is_empty() {
+            section = section.with_paragraph(format!(
+                "On {} each frame took the time of its bits, including its stuff bits, as on a real bus. Time stamps \
+                 are the ends of frames.",
+                names(&timed)
+            ));
+        }
+        let text = "This run is rated by its second with the highest load; the worst case assumes that all cells answer \
                     with the longest possible frames. Frames that only a bench sends are left out: stimuli, sync and \
                     report with their answers, and simulated wires. Start-up, before the first joints message, \
                     is shown separately.";
         let assumed = self.run.bus_figures.iter().any(|bus_figures| !bus_figures.rates.is_chosen);
-        let mut section = Section::new("load", "Load of the buses").with_paragraph(text);
+        section = section.with_paragraph(text);
         if assumed {
             section = section.with_paragraph(
                 "The skin does not give bit rates for every bus; for the others, common bit rates are assumed, and \
