@@ -16,6 +16,7 @@ mod last_times;
 pub mod log;
 mod magic;
 mod mcap;
+mod messages;
 mod parts;
 mod place;
 mod places;
@@ -30,6 +31,7 @@ pub use extras::{
 };
 pub use mcap::ORIGIN_METADATA;
 pub(crate) use mcap::is_foreign_frame;
+pub use messages::{ChannelDescription, MessageReader, RecordedMessage};
 pub use parts::{PartsError, RecordingPart};
 pub use place::{SeekIndex, SeekPoint};
 pub use reader::Reader;
