@@ -14,7 +14,7 @@ use super::backlog;
 use super::facts::realtime_minus_monotonic;
 use super::feed::{BusFeed, CapturedItem, RecorderFeed, frame_queue_length};
 use super::text::CandumpWriter;
-use super::topics::{ROBOT_MESSAGE_COUNT, Topics};
+use super::topics::{BusHealth, ROBOT_MESSAGE_COUNT, Topics};
 use super::{RecordingOutputs, StopRequest};
 use crate::bus::realtime::wall_clock_ns;
 use model::latched::LatchedPackets;
@@ -474,27 +474,11 @@ fn dropped_frames_line(frames: u64, place: &str, total: u64) -> String {
 
 /// Returns the diagnosis of a bus for the diagnostics topic.
 fn diagnose_bus(bus_feed: &BusFeed, name: &str, seen: &BusRecord) -> Diagnosis {
-    let works = bus_feed.state.is_working();
     let (mut cells, mut silent) = (0, 0);
     if let Ok(view) = bus_feed.view.lock() {
         cells = view.cells.len();
         silent = view.cells.iter().filter(|cell| !cell.seen || cell.dead).count();
     }
-    let (level, message) = match (works, silent, seen.dropped) {
-        (false, _, _) => (DiagnosisLevel::Error, "the bus does not work"),
-        (true, 0, 0) => (DiagnosisLevel::Ok, "all cells are present"),
-        (true, 0, _) => (DiagnosisLevel::Warn, "frames were dropped"),
-        (true, _, _) => (DiagnosisLevel::Warn, "cells are silent"),
-    };
-    Diagnosis {
-        level,
-        name: format!("gateway: bus {name}"),
-        message: message.to_owned(),
-        values: vec![
-            ("cells", cells.to_string()),
-            ("silent", silent.to_string()),
-            ("frames", seen.frames.to_string()),
-            ("dropped", seen.dropped.to_string()),
-        ],
-    }
+    let works = bus_feed.state.is_working();
+    BusHealth { works, cells, silent, frames: seen.frames, dropped: seen.dropped }.diagnosis(name)
 }

@@ -15,11 +15,10 @@ use trace::capture::CaptureNote;
 use trace::recording::NOTES_TOPIC;
 use trace::recording::file::Channel;
 use trace::recording::layout::{Layout, Patch};
-use trace::recording::series::Writer;
-use trace::recording::window::ReorderWindow;
+use trace::recording::message_sink::{ChannelSink, MessageSink};
 use trace::ros2::robot::{StringMessage, Transforms};
 use trace::ros2::skin::{ContactState, LoopTiming, PatchState, Torques};
-use trace::ros2::standard::{Diagnosis, Diagnostics, JointState, Point, PointCloud};
+use trace::ros2::standard::{Diagnosis, DiagnosisLevel, Diagnostics, JointState, Point, PointCloud};
 
 /// QoS profile that bag tools store for latched topics: readers that join later get the last message.
 const LATCHED_QOS: (&str, &str) = (
@@ -38,17 +37,17 @@ const ROBOT_DESCRIPTION_TOPIC: &str = "/robot_description";
 /// Number of messages that [`Topics::write_robot`] writes.
 pub const ROBOT_MESSAGE_COUNT: u64 = 2;
 
-/// Channels of one file.
+/// Channels of one file, or of the viewers that are connected.
 #[derive(Debug)]
 pub struct Topics {
     can: Vec<Channel>,
     state: Vec<Channel>,
     notes: Channel,
     joint_states: Channel,
-    joint_commands: Channel,
     torques: Channel,
-    timing: Channel,
     diagnostics: Channel,
+    /// Channels of the control loop: joint commands and timing. Frames do not show them.
+    control: Option<[Channel; 2]>,
     /// Channels of moving links, fixed links and the description.
     robot: Option<[Channel; 3]>,
     /// Channels of each patch: its state and its points.
@@ -60,64 +59,75 @@ impl Topics {
     ///
     /// # Errors
     /// Returns [`io::Error`] if the file cannot be written.
-    pub fn new(writer: &mut Writer, layout: &Layout) -> io::Result<Self> {
-        let digits = [("time_digits", "9")];
-        let of_arm = ["joint_states", "joint_commands", "torques"];
-        let of_arm = of_arm.map(|topic| format!("/{}/{topic}", layout.arm));
-        let fixed = [
-            NOTES_TOPIC,
-            TIMING_TOPIC,
-            DIAGNOSTICS_TOPIC,
-            TF_TOPIC,
-            TF_STATIC_TOPIC,
-            ROBOT_DESCRIPTION_TOPIC,
-        ]
-        .map(str::to_owned);
-        let others = fixed.into_iter().chain(of_arm.iter().cloned());
-        let [can, state] = layout.bus_topics(others).map(|topics| -> io::Result<Vec<Channel>> {
-            topics.iter().map(|topic| writer.channel::<Record<'_>>(topic, &digits)).collect()
-        });
-        let (can, state) = (can?, state?);
+    pub fn new(writer: &mut impl ChannelSink, layout: &Layout) -> io::Result<Self> {
+        let mut topics = Self::for_frames(writer, layout)?;
+        let [_, state] = bus_topics(layout);
+        topics.state = add_frame_channels(writer, &state)?;
+        let [_, commands, _] = arm_topics(layout);
+        topics.control = Some([
+            writer.add_channel::<JointState<'_>>(&commands, &[])?,
+            writer.add_channel::<LoopTiming>(TIMING_TOPIC, &[])?,
+        ]);
+        Ok(topics)
+    }
+
+    /// Creates the channels that a program can fill which only receives the frames of the buses.
+    ///
+    /// # Errors
+    /// Returns [`io::Error`] if the file cannot be written.
+    pub fn for_frames(writer: &mut impl ChannelSink, layout: &Layout) -> io::Result<Self> {
+        let [can, _] = bus_topics(layout);
+        let can = add_frame_channels(writer, &can)?;
         let patches = layout.patches.iter().map(|Patch { topic, .. }| {
-            let state = writer.channel::<PatchState<'_>>(topic, &[])?;
-            Ok([state, writer.channel::<PointCloud<'_>>(&format!("{topic}/points"), &[])?])
+            let state = writer.add_channel::<PatchState<'_>>(topic, &[])?;
+            Ok([state, writer.add_channel::<PointCloud<'_>>(&format!("{topic}/points"), &[])?])
         });
         let patches = patches.collect::<io::Result<_>>()?;
-        let [states, commands, torques] = &of_arm;
         let robot = layout.robot.is_some().then(|| {
-            let moving = writer.channel::<Transforms<'_>>(TF_TOPIC, &[])?;
-            let still = writer.channel::<Transforms<'_>>(TF_STATIC_TOPIC, &[LATCHED_QOS])?;
+            let moving = writer.add_channel::<Transforms<'_>>(TF_TOPIC, &[])?;
+            let still = writer.add_channel::<Transforms<'_>>(TF_STATIC_TOPIC, &[LATCHED_QOS])?;
             Ok::<_, io::Error>([
                 moving,
                 still,
-                writer.channel::<StringMessage<'_>>(ROBOT_DESCRIPTION_TOPIC, &[LATCHED_QOS])?,
+                writer.add_channel::<StringMessage<'_>>(ROBOT_DESCRIPTION_TOPIC, &[LATCHED_QOS])?,
             ])
         });
+        let [states, _, torques] = arm_topics(layout);
         Ok(Self {
             can,
-            state,
-            notes: writer.channel::<CaptureNote<'_>>(NOTES_TOPIC, &[])?,
-            joint_states: writer.channel::<JointState<'_>>(states, &[])?,
-            joint_commands: writer.channel::<JointState<'_>>(commands, &[])?,
-            torques: writer.channel::<Torques<'_>>(torques, &[])?,
-            timing: writer.channel::<LoopTiming>(TIMING_TOPIC, &[])?,
-            diagnostics: writer.channel::<Diagnostics<'_>>(DIAGNOSTICS_TOPIC, &[])?,
+            state: Vec::new(),
+            notes: writer.add_channel::<CaptureNote<'_>>(NOTES_TOPIC, &[])?,
+            joint_states: writer.add_channel::<JointState<'_>>(&states, &[])?,
+            torques: writer.add_channel::<Torques<'_>>(&torques, &[])?,
+            diagnostics: writer.add_channel::<Diagnostics<'_>>(DIAGNOSTICS_TOPIC, &[])?,
+            control: None,
             robot: robot.transpose()?,
             patches,
         })
     }
 
     /// Writes the robot's fixed transforms and description, if known.
-    pub fn write_robot(&mut self, window: &mut ReorderWindow, layout: &Layout, nanos: u64) {
+    pub fn write_robot(&mut self, window: &mut impl MessageSink, layout: &Layout, nanos: u64) {
         let (Some(robot), Some([_, still, description])) = (&layout.robot, &mut self.robot) else { return };
         window.write(still, nanos, &Transforms { nanos, transforms: &robot.fixed_transforms() });
         window.write(description, nanos, &StringMessage(&robot.description));
     }
 
     /// Writes a frame of a bus.
-    pub fn write_frame(&mut self, window: &mut ReorderWindow, bus: usize, name: &str, seen: &LatchedFrame) {
+    pub fn write_frame(
+        &mut self,
+        window: &mut impl MessageSink,
+        bus: usize,
+        name: &str,
+        seen: &LatchedFrame,
+    ) {
+        self.write_record(window, bus, &frame_record(name, seen));
+    }
+
+    /// Writes a frame of a bus, whose sender may be unknown.
+    pub fn write_record(&mut self, window: &mut impl MessageSink, bus: usize, record: &Record<'_>) {
         if let Some(channel) = self.can.get_mut(bus) {
-            window.write(channel, seen.at_nanos, &frame_record(name, seen));
+            window.write(channel, record.time.nanos, record);
         }
     }
 
@@ -125,7 +135,7 @@ impl Topics {
     /// time may be much earlier, and viewers would start there.
     pub fn write_latched_frame(
         &mut self,
-        window: &mut ReorderWindow,
+        window: &mut impl MessageSink,
         nanos: u64,
         (bus, name): (usize, &str),
         seen: &LatchedFrame,
@@ -136,7 +146,7 @@ impl Topics {
     }
 
     /// Writes a note between frames. A note about a bus comes after the frames recorded from that bus.
-    pub fn write_note(&mut self, window: &mut ReorderWindow, bus: Option<usize>, note: &CaptureNote<'_>) {
+    pub fn write_note(&mut self, window: &mut impl MessageSink, bus: Option<usize>, note: &CaptureNote<'_>) {
         let channel = bus.and_then(|bus| self.can.get(bus));
         let heard = channel.map(|channel| window.latest_ns(channel)).filter(|heard| *heard > 0);
         window.write_sorted_at(&mut self.notes, heard.unwrap_or(note.nanos), note.nanos, note);
@@ -145,7 +155,7 @@ impl Topics {
     /// Writes a control tick that was due at `nanos`.
     pub fn write_tick(
         &mut self,
-        window: &mut ReorderWindow,
+        window: &mut impl MessageSink,
         layout: &Layout,
         nanos: u64,
         timed: &TimedRecord,
@@ -159,30 +169,52 @@ impl Topics {
             [&record.q, &record.qdot, &record.torque, &record.command]
                 .map(|values| first_values(names.len(), values));
         let state = JointState { nanos, names, position, velocity, effort };
-        window.write(&mut self.joint_states, nanos, &state);
-        let command = JointState { nanos, names, position, velocity: command, effort };
-        window.write(&mut self.joint_commands, nanos, &command);
+        self.write_joint_states(window, &state);
+        if let Some([commands, _]) = &mut self.control {
+            let command = JointState { nanos, names, position, velocity: command, effort };
+            window.write(commands, nanos, &command);
+        }
         let (central, active) = match &timed.central {
             Some((_, reference)) => (first_values(names.len(), &reference.torque), reference.active),
             None => (&[][..], 0),
         };
-        window.write(&mut self.torques, nanos, &Torques { nanos, distributed: effort, central, active });
-        window.write(&mut self.timing, nanos, &loop_timing(nanos, timed));
-        if layout.records_poses_at(record.tick.number)
-            && let (Some(robot), Some([moving, ..])) = (&layout.robot, &mut self.robot)
-        {
-            window.write(
-                moving,
-                nanos,
-                &Transforms { nanos, transforms: &robot.moving_transforms(position) },
-            );
+        self.write_torques(window, &Torques { nanos, distributed: effort, central, active });
+        if let Some([_, timing]) = &mut self.control {
+            window.write(timing, nanos, &loop_timing(nanos, timed));
+        }
+        if layout.records_poses_at(record.tick.number) {
+            self.write_poses(window, layout, nanos, position);
+        }
+    }
+
+    /// Writes the state of the joints.
+    pub fn write_joint_states(&mut self, window: &mut impl MessageSink, state: &JointState<'_>) {
+        window.write(&mut self.joint_states, state.nanos, state);
+    }
+
+    /// Writes the distributed and the central torques.
+    pub fn write_torques(&mut self, window: &mut impl MessageSink, torques: &Torques<'_>) {
+        window.write(&mut self.torques, torques.nanos, torques);
+    }
+
+    /// Writes the poses of the links that joints move, if the robot is known.
+    pub fn write_poses(
+        &mut self,
+        window: &mut impl MessageSink,
+        layout: &Layout,
+        nanos: u64,
+        position: &[f64],
+    ) {
+        if let (Some(robot), Some([moving, ..])) = (&layout.robot, &mut self.robot) {
+            let transforms = &robot.moving_transforms(position);
+            window.write(moving, nanos, &Transforms { nanos, transforms });
         }
     }
 
     /// Writes the contact states of a patch's cells, and their points if the joint positions are given.
     pub fn write_patch(
         &mut self,
-        window: &mut ReorderWindow,
+        window: &mut impl MessageSink,
         layout: &Layout,
         place: usize,
         touched: &EpochContacts,
@@ -219,9 +251,66 @@ impl Topics {
     }
 
     /// Writes the diagnostics.
-    pub fn write_diagnostics(&mut self, window: &mut ReorderWindow, nanos: u64, parts: &[Diagnosis]) {
+    pub fn write_diagnostics(&mut self, window: &mut impl MessageSink, nanos: u64, parts: &[Diagnosis]) {
         window.write(&mut self.diagnostics, nanos, &Diagnostics { nanos, parts });
     }
+}
+
+/// State of a bus, from which its diagnosis is made.
+#[derive(Clone, Copy, Debug)]
+pub struct BusHealth {
+    /// True if the bus is open and works.
+    pub works: bool,
+    /// Number of cells on the bus.
+    pub cells: usize,
+    /// Number of cells that send nothing.
+    pub silent: usize,
+    /// Number of frames received.
+    pub frames: u64,
+    /// Number of frames dropped.
+    pub dropped: u64,
+}
+
+impl BusHealth {
+    /// Returns the diagnosis of the bus with this name.
+    #[must_use]
+    pub fn diagnosis(self, name: &str) -> Diagnosis {
+        let Self { works, cells, silent, frames, dropped } = self;
+        let (level, message) = match (works, silent, dropped) {
+            (false, _, _) => (DiagnosisLevel::Error, "the bus does not work"),
+            (true, 0, 0) => (DiagnosisLevel::Ok, "all cells are present"),
+            (true, 0, _) => (DiagnosisLevel::Warn, "frames were dropped"),
+            (true, _, _) => (DiagnosisLevel::Warn, "cells are silent"),
+        };
+        Diagnosis {
+            level,
+            name: format!("gateway: bus {name}"),
+            message: message.to_owned(),
+            values: vec![
+                ("cells", cells.to_string()),
+                ("silent", silent.to_string()),
+                ("frames", frames.to_string()),
+                ("dropped", dropped.to_string()),
+            ],
+        }
+    }
+}
+
+/// Returns the topics of the robot's joints: states, commands and torques.
+fn arm_topics(layout: &Layout) -> [String; 3] {
+    ["joint_states", "joint_commands", "torques"].map(|topic| format!("/{}/{topic}", layout.arm))
+}
+
+/// Returns the topics of each bus: of its frames, and of frames that were latched before.
+fn bus_topics(layout: &Layout) -> [Vec<String>; 2] {
+    let fixed =
+        [NOTES_TOPIC, TIMING_TOPIC, DIAGNOSTICS_TOPIC, TF_TOPIC, TF_STATIC_TOPIC, ROBOT_DESCRIPTION_TOPIC];
+    layout.bus_topics(fixed.map(str::to_owned).into_iter().chain(arm_topics(layout)))
+}
+
+fn add_frame_channels(writer: &mut impl ChannelSink, topics: &[String]) -> io::Result<Vec<Channel>> {
+    let digits = [("time_digits", "9")];
+    topics.iter().map(|topic| writer.add_channel::<Record<'_>>(topic, &digits)).collect()
 }
 
 fn frame_record<'a>(interface: &'a str, seen: &LatchedFrame) -> Record<'a> {

@@ -111,8 +111,15 @@ pub struct Channel {
 }
 
 impl Channel {
+    /// Creates a channel with a given number, for a destination that is not a file.
+    #[must_use]
+    pub const fn with_id(id: u16) -> Self {
+        Self { id, sequence: 0, is_frames: false }
+    }
+
     /// Returns the number of the channel.
-    pub(super) const fn id(&self) -> u16 {
+    #[must_use]
+    pub const fn id(&self) -> u16 {
         self.id
     }
 

@@ -3,6 +3,7 @@
 pub mod account;
 pub mod file;
 pub mod layout;
+pub mod message_sink;
 pub mod names;
 mod output;
 mod publish;
