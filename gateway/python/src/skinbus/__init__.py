@@ -58,16 +58,22 @@ __all__ = [
     "Unconfirmed",
     "program_path",
     "read",
+    "to_rerun",
 ]
 
 if TYPE_CHECKING:
     from skinbus.recording import read
+    from skinbus.rerun import to_rerun
 
 
 def __getattr__(name: str) -> Any:
-    """Imports `read` and with it numpy when it is used: tests that only press cells start sooner."""
+    """Imports `read` and `to_rerun` when they are used, with numpy: tests that only press cells start sooner."""
     if name == "read":
         from skinbus.recording import read
 
         return read
+    if name == "to_rerun":
+        from skinbus.rerun import to_rerun
+
+        return to_rerun
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -84,6 +84,7 @@ class Bench:
             # A bus of the kernel has one name on the whole machine.
             arguments += ["--bus-kind", "embedded"]
         self._arguments = [*arguments, *options]
+        self._skin = os.fspath(skin)
         self._timeout = timeout
         self._directory = None if directory is None else Path(directory).absolute()
         self._has_private_directory = spawn and directory is None
@@ -191,6 +192,11 @@ class Bench:
         self._started()
         assert self._ready is not None
         return self._ready
+
+    @property
+    def skin(self) -> str:
+        """Path of the skin's file."""
+        return self._skin
 
     @property
     def directory(self) -> Path | None:
