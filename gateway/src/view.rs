@@ -18,15 +18,18 @@ use clap::Args;
 use protocol::skin::Skin;
 use protocol::usage::Failure;
 use trace::capture::{CaptureError, CaptureFormat, Reader};
-use view::RowMesh;
+use trace::recording::robot::RecordedRobot;
+use view::foxglove::{FoxgloveOptions, foxglove_url};
 use view::play::{self, play_recording};
 use view::player::PlayError;
 use view::serve::{ServeError, ServeOptions, serve};
 use view::server::{PageAccess, page_url};
+use view::{RowMesh, Token};
 
 use super::arguments::{BusKinds, bus_names, find_bus, parse_time_ns};
 use super::input::{no_frame_failure, note_skin_difference, read_skin, skin_of_recording, stop_flag};
 use super::output::print_note;
+use super::robot_file::{SkinRobot, urdf_path};
 use super::surface::robot_meshes;
 use super::visuals::PackageOptions;
 use address::AddressFile;
@@ -51,6 +54,7 @@ const DEFAULT_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHO
   skinbus demo --view
   skinbus view gateway/examples/ur5-253.toml --bus-kind embedded
   skinbus view can1 --skin humanoid.toml
+  skinbus view run.mcap --foxglove 8765
   skinbus view run.mcap run-*.mcap --at 12.5
   skinbus view run.log --skin skin.toml
   skinbus view skin.toml --listen 0.0.0.0:8100 --token-file token --read-only")]
@@ -82,6 +86,10 @@ pub(crate) struct ViewCommand {
     /// If a bus does not exist yet, wait for it instead of failing
     #[arg(long)]
     wait: bool,
+    /// Also serve the topics of a recording, live or as the page plays it, to Foxglove and Lichtblick: on this port of
+    /// this machine, by Foxglove's WebSocket protocol; port 0 stands for any free port
+    #[arg(long, value_name = "PORT")]
+    foxglove: Option<u16>,
     /// Serve the run that started this program: accept connections on the listener at standard input, exchange commands
     /// and states over the socket at standard output, and end with the run
     #[arg(long, hide = true)]
@@ -111,12 +119,42 @@ struct PageServer {
     access: PageAccess,
     /// Address of the page, if this program prints it; `None` if the run prints it.
     url: Option<String>,
+    viewers: Option<ViewerServer>,
+}
+
+/// The socket of Foxglove's viewers, and the token that the user has chosen for them.
+struct ViewerServer {
+    listener: TcpListener,
+    token: Option<Token>,
+    url: String,
+}
+
+impl ViewerServer {
+    /// Opens the socket.
+    fn bind(port: u16, token: Option<Token>) -> Result<Self, Failure> {
+        let failed = |error: io::Error| {
+            let hint = bind_hint(&error);
+            Failure::usage_error(format!("--foxglove {port}: {error}; {hint}, or 0 for any free port"))
+        };
+        let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, port)).map_err(failed)?;
+        let url = foxglove_url(listener.local_addr().map_err(failed)?, token.as_ref());
+        Ok(Self { listener, token, url })
+    }
+
+    fn options(self, robot: Option<RecordedRobot>) -> FoxgloveOptions {
+        FoxgloveOptions { listener: self.listener, token: self.token, robot }
+    }
 }
 
 impl ViewCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let is_recording = self.is_recording()?;
         let may_act = !self.read_only && !is_recording;
+        let viewers = self.foxglove.map(|port| {
+            self.check_served_to_viewers(port, is_recording)?;
+            ViewerServer::bind(port, token::chosen_token(self.token_file.as_deref())?)
+        });
+        let viewers = viewers.transpose()?;
         let (listener, token) = if self.of_run {
             (inherited_listener().map_err(|error| view_failure(&error))?, token::chosen_token(None)?)
         } else {
@@ -130,9 +168,23 @@ impl ViewCommand {
         let url = (!self.of_run).then(|| page_url(address, token.as_ref()));
         let of_file = self.address_file.as_deref().zip(url.as_deref());
         let _file = of_file.map(|(path, url)| AddressFile::write(path, url)).transpose()?;
-        let served =
-            PageServer { listener, access: PageAccess { may_act, may_play: is_recording, token }, url };
+        let access = PageAccess { may_act, may_play: is_recording, token };
+        let served = PageServer { listener, access, url, viewers };
         if is_recording { self.serve_recording(served) } else { self.serve_live(served) }
+    }
+
+    /// Checks that the messages to be served exist: a candump log has none.
+    fn check_served_to_viewers(&self, port: u16, is_recording: bool) -> Result<(), Failure> {
+        for path in self.sources.iter().filter(|_| is_recording) {
+            if Reader::open(path).map_err(Failure::usage_error)?.format() == CaptureFormat::Candump {
+                let path = path.display();
+                return Err(Failure::usage_error(format!(
+                    "--foxglove {port}: {path} is a candump log, and only an MCAP recording has topics: convert \
+                     it with `skinbus convert {path} -o FILE.mcap`, or leave the option out"
+                )));
+            }
+        }
+        Ok(())
     }
 
     /// Serves the page of live buses.
@@ -153,7 +205,13 @@ impl ViewCommand {
         let kinds = self.kinds.kinds_of_buses(bus_names(&skin))?;
         let stop = stop_flag()?;
         let bench = self.of_run.then(connect_to_run).transpose().map_err(|error| view_failure(&error))?;
-        let PageServer { listener, access, url } = served;
+        let PageServer { listener, access, url, viewers } = served;
+        let viewers_url = viewers.as_ref().map(|viewers| viewers.url.clone());
+        let foxglove = viewers.map(|viewers| {
+            let urdf = skin.robot.urdf.as_deref();
+            let urdf = self.skin_file().zip(urdf).map(|(skin, urdf)| urdf_path(skin, urdf));
+            Ok::<_, Failure>(viewers.options(SkinRobot::read(&skin, urdf.as_deref())?.robot))
+        });
         let options = ServeOptions {
             skin,
             surface,
@@ -163,8 +221,9 @@ impl ViewCommand {
             access,
             waits_for_buses: self.wait,
             bench,
+            foxglove: foxglove.transpose()?,
         };
-        serve(options, &stop, || print_address(url)).map_err(Failure::usage_error)?;
+        serve(options, &stop, || print_addresses(url, viewers_url)).map_err(Failure::usage_error)?;
         Ok(())
     }
 
@@ -196,17 +255,29 @@ impl ViewCommand {
         let at_s = self.at.map(|nanos| nanos as f64 / 1e9);
         let stop = stop_flag()?;
         let warns = |what: &str| print_note(format_args!("{what}"));
-        let PageServer { listener, access, url } = served;
-        let options = play::PlayOptions { paths: self.sources, skin, surface, listener, access, at_s };
-        play_recording(options, &stop, || print_address(url), warns).map_err(|error| match error {
-            ServeError::Play(PlayError::Damaged(_) | PlayError::Capture(CaptureError::Damaged { .. })) => {
-                Failure::run_error(error)
-            }
-            ServeError::Bus(_) | ServeError::Play(_) | ServeError::Thread(_) | ServeError::Server(_) => {
-                Failure::usage_error(error)
+        let PageServer { listener, access, url, viewers } = served;
+        let viewers_url = viewers.as_ref().map(|viewers| viewers.url.clone());
+        let foxglove = viewers.map(|viewers| viewers.options(None));
+        let options =
+            play::PlayOptions { paths: self.sources, skin, surface, listener, access, at_s, foxglove };
+        play_recording(options, &stop, || print_addresses(url, viewers_url), warns).map_err(|error| {
+            match error {
+                ServeError::Play(
+                    PlayError::Damaged(_) | PlayError::Capture(CaptureError::Damaged { .. }),
+                ) => Failure::run_error(error),
+                ServeError::Bus(_)
+                | ServeError::Play(_)
+                | ServeError::Thread(_)
+                | ServeError::Server(_)
+                | ServeError::Viewers(_) => Failure::usage_error(error),
             }
         })?;
         Ok(())
+    }
+
+    /// Returns the skin's file of live buses.
+    fn skin_file(&self) -> Option<&Path> {
+        self.skin.as_deref().or_else(|| self.sources.first().map(PathBuf::as_path))
     }
 
     /// Reads a skin with the meshes of its robot, as far as they are found.
@@ -261,22 +332,28 @@ impl ViewCommand {
 
 /// Returns the error for an address at which no page can be served.
 fn bind_error(listen: SocketAddr, error: &io::Error) -> Failure {
-    let is = |kind| error.kind() == kind;
-    let hint = if is(io::ErrorKind::AddrNotAvailable) {
-        "name an address of this machine"
-    } else if is(io::ErrorKind::PermissionDenied) {
-        "name a port of at least 1024"
-    } else {
-        "name another port"
-    };
+    let hint = bind_hint(error);
     Failure::usage_error(format!(
         "--listen {listen}: {error}; {hint}, or leave --listen out for a free port of this machine"
     ))
 }
 
-/// Prints the address of the page.
-fn print_address(url: Option<String>) {
-    url.iter().for_each(|url| print_note(format_args!("view: {url}")));
+/// Returns what to do after an error of opening a socket.
+fn bind_hint(error: &io::Error) -> &'static str {
+    let is = |kind| error.kind() == kind;
+    if is(io::ErrorKind::AddrNotAvailable) {
+        "name an address of this machine"
+    } else if is(io::ErrorKind::PermissionDenied) {
+        "name a port of at least 1024"
+    } else {
+        "name another port"
+    }
+}
+
+/// Prints the addresses of the page and of Foxglove's viewers.
+fn print_addresses(page: Option<String>, viewers: Option<String>) {
+    page.iter().for_each(|url| print_note(format_args!("view: {url}")));
+    viewers.iter().for_each(|url| print_note(format_args!("foxglove: {url}")));
 }
 
 /// Returns the connection to the run that has started this program: a socket that is this program's standard output.
@@ -340,7 +417,7 @@ impl PageProcess {
         // Put the page into its own process group, so that Ctrl-C does not reach it: the run ends the page.
         command.process_group(0).stdin(OwnedFd::from(listener)).stdout(OwnedFd::from(there));
         let process = command.spawn().map_err(|error| view_failure(&error))?;
-        print_address(Some(url));
+        print_addresses(Some(url), None);
         let remote = Remote { name: "view", lines, ends_run: false };
         Ok((Self { process, _address_file: address_file }, remote))
     }

@@ -14,6 +14,8 @@
 //!
 //! A skin without buses is shown as a [`StaticSkinPage`]: one HTML file with the same scene, drawn by the same scripts.
 //!
+//! [`foxglove`] sends the topics of a recording to other programs that show them, live or as it is played.
+//!
 //! [`control`] is the same for programs: commands on standard input, events on standard output.
 //!
 //! [`live`], [`pressed`], [`scene`], [`still`], [`surface`], [`command`], [`page_command`] and [`tape`] use neither sockets nor clocks.
@@ -22,6 +24,7 @@
 pub mod command;
 pub mod control;
 mod followed;
+pub mod foxglove;
 pub mod index;
 pub mod live;
 pub mod page_command;

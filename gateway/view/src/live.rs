@@ -4,6 +4,7 @@ pub(crate) mod bus;
 mod recent;
 mod said;
 
+use bench::record::feed::EpochContacts;
 use model::table::CellStatus;
 use protocol::can::Frame;
 use protocol::id::CellId;
@@ -132,7 +133,7 @@ impl LiveState {
     }
 
     /// Returns three values for each joint of the robot: position, distributed torque and central torque.
-    fn joint_positions_and_torques(&self) -> Vec<[f64; 3]> {
+    pub(crate) fn joint_positions_and_torques(&self) -> Vec<[f64; 3]> {
         let mut rows = vec![[0.0_f64; 3]; self.skin.robot.joints.len()];
         for (index, bus) in self.buses.iter().enumerate() {
             for ((place, (joint, _)), torque) in
@@ -145,6 +146,38 @@ impl LiveState {
             }
         }
         rows
+    }
+
+    /// Returns the number of the newest joints on a bus, and the contacts of its cells since then.
+    pub(crate) fn newest_contacts(&self, bus: usize) -> Option<(u64, EpochContacts)> {
+        let table = &self.buses.get(bus)?.table;
+        let (number, epoch, at) = table.newest_joints()?;
+        let cells = table.presumed_sensors(at).collect();
+        Some((number, EpochContacts { at_nanos: at.0 * 1_000, epoch: epoch.0, cells }))
+    }
+
+    /// Returns true if the joints of a bus count as epochs.
+    pub(crate) fn is_clock(&self, bus: usize) -> bool {
+        self.clock == Some(bus)
+    }
+
+    /// Returns the number of cells with a force above zero.
+    pub(crate) fn active_cell_count(&self) -> usize {
+        let forces = self.buses.iter().flat_map(|bus| {
+            let sensors = bus.table.cells().iter().enumerate();
+            sensors.map(|(place, cell)| {
+                bus.central.cell_force(place, &cell.presumed_sensors().unwrap_or_default())
+            })
+        });
+        forces.filter(|force| *force > 0.0).count()
+    }
+
+    /// Returns three values of a bus: true if it works, the number of its cells, and the number of silent ones.
+    pub(crate) fn bus_health(&self, bus: usize, now: Micros) -> (bool, usize, usize) {
+        let Some(bus) = self.buses.get(bus) else { return (false, 0, 0) };
+        let is_silent = |status| matches!(status, CellStatus::Unknown | CellStatus::Dead);
+        let silent = bus.table.statuses(now).filter(|(_, status)| is_silent(*status)).count();
+        (bus.is_up, bus.table.cells().len(), silent)
     }
 
     /// Sets the state of a bus: whether it is open and works, and the number of frames that this program did not

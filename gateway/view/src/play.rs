@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use protocol::skin::Skin;
 use trace::capture::Reader;
 
+use crate::foxglove::{FoxgloveOptions, FoxgloveServer, PlayedTopics};
 use crate::index::Progress;
 use crate::live::StatusMessage;
 use crate::page_command::{PageCommand, PlaybackCommand};
@@ -44,6 +45,8 @@ pub struct PlayOptions {
     /// The position at which playback is paused at first, in s of the run or in s since the first frame. If it is
     /// `None`, playback starts at the beginning.
     pub at_s: Option<f64>,
+    /// The server of Foxglove's viewers, if there is one.
+    pub foxglove: Option<FoxgloveOptions>,
 }
 
 /// Plays a recording until `stop` is set. Calls `is_served` once pages can connect, and `warns` with each defect of the
@@ -58,13 +61,15 @@ pub fn play_recording(
     is_served: impl FnOnce(),
     warns: impl Fn(&str) + Sync,
 ) -> Result<ServerCounts, ServeError> {
-    let PlayOptions { paths, skin, surface, listener, access, at_s } = options;
+    let PlayOptions { paths, skin, surface, listener, access, at_s, foxglove } = options;
     let mut player = Player::open(&paths, skin.clone())?;
     let reader = Reader::open_all(&paths).map_err(PlayError::from)?;
     let (shells, corners) = pack_meshes(&surface);
     let scene =
         serde_json::to_string(&Scene { shells, ..Scene::from_skin(&skin, false) }).unwrap_or_default();
     let server = Server::start(listener, access, scene, corners).map_err(ServeError::Server)?;
+    let viewers = foxglove.map(|options| serve_viewers(options, reader.name(), &paths)).transpose()?;
+    let (_viewers, mut topics) = viewers.unzip();
     is_served();
     let (index, times) = (player.index(), (player.first_frame_ns(), player.time_origin_ns()));
     let name = reader.name().to_owned();
@@ -81,14 +86,31 @@ pub fn play_recording(
             Some(at_s) => player.seek(at_s).map_err(PlayError::from)?,
             None => player.play(1.0),
         }
-        publish_and_execute(&mut player, &server, stop);
+        publish_and_execute(&mut player, (&server, topics.as_mut()), stop);
         Ok::<_, ServeError>(())
     })?;
     index.progress().failed.map_or_else(|| Ok(server.counts()), |what| Err(PlayError::Damaged(what).into()))
 }
 
-/// Sends the state of the player to the pages, and executes their commands.
-fn publish_and_execute(player: &mut Player, server: &Server, stop: &AtomicBool) {
+/// Starts the server of viewers. Returns it with the topics that it sends.
+fn serve_viewers(
+    options: FoxgloveOptions,
+    name: &str,
+    paths: &[PathBuf],
+) -> Result<(FoxgloveServer, PlayedTopics), ServeError> {
+    let FoxgloveOptions { listener, token, robot: _ } = options;
+    let name = format!("skinbus: {name}");
+    let server = FoxgloveServer::start(listener, token, name, true).map_err(ServeError::Viewers)?;
+    let topics = PlayedTopics::open(&server, paths).map_err(PlayError::from)?;
+    Ok((server, topics))
+}
+
+/// Sends the state of the player to the pages and viewers, and executes the commands of pages.
+fn publish_and_execute(
+    player: &mut Player,
+    (server, mut viewers): (&Server, Option<&mut PlayedTopics>),
+    stop: &AtomicBool,
+) {
     let nobody = TouchRegistry::default();
     let (mut next, mut before) = (Instant::now(), Instant::now());
     let (mut number, mut jumps) = (0_u64, u64::MAX);
@@ -117,6 +139,9 @@ fn publish_and_execute(player: &mut Player, server: &Server, stop: &AtomicBool) 
         }
         if let Some(failed) = failed {
             player.pause_with_error(failed);
+        }
+        if let Some(topics) = &mut viewers {
+            topics.publish_until(player.position_ns(), player.is_at_end(), player.jump_count());
         }
         if server.page_count() > 0 {
             let now = player.now();

@@ -170,6 +170,18 @@ impl Player {
         Micros(self.at / 1_000)
     }
 
+    /// Returns the present position, in ns since 1970.
+    #[must_use]
+    pub const fn position_ns(&self) -> u64 {
+        self.at
+    }
+
+    /// Returns true if the position is the end of the recording, and that is known.
+    #[must_use]
+    pub fn is_at_end(&self) -> bool {
+        self.index.progress().is_over && self.at >= self.end_ns()
+    }
+
     /// Returns the number of jumps so far.
     #[must_use]
     pub const fn jump_count(&self) -> u64 {

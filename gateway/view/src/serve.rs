@@ -1,6 +1,7 @@
 //! Shows a bench to pages: receives on its buses, and runs the server.
 
 use std::collections::BTreeMap;
+use std::io;
 use std::iter;
 use std::net::TcpListener;
 use std::path::PathBuf;
@@ -19,6 +20,7 @@ use protocol::time::Micros;
 
 use crate::command::{ControlCommand, DirectCommand, ResolvedCommand};
 use crate::followed::{BusOpener, FollowedBus, time_of_read_frames};
+use crate::foxglove::{FoxgloveOptions, FoxgloveServer, LiveTopics};
 use crate::live::{LiveState, StatusMessage};
 use crate::lock_ignoring_poison;
 use crate::page_command::PageCommand;
@@ -54,6 +56,8 @@ pub struct ServeOptions {
     pub waits_for_buses: bool,
     /// The connection to the bench that the pages control. The view ends with the bench.
     pub bench: Option<JsonPipe>,
+    /// The server of Foxglove's viewers, if there is one.
+    pub foxglove: Option<FoxgloveOptions>,
 }
 
 /// The reason why a skin cannot be shown.
@@ -67,10 +71,13 @@ pub enum ServeError {
     Play(#[from] PlayError),
     /// A thread for a bus or for the recording cannot be started.
     #[error("cannot start a thread: {0}")]
-    Thread(std::io::Error),
+    Thread(io::Error),
     /// The server cannot be started.
     #[error("cannot serve the page: {0}")]
-    Server(std::io::Error),
+    Server(io::Error),
+    /// The server of viewers cannot be started.
+    #[error("--foxglove: cannot serve viewers: {0}")]
+    Viewers(io::Error),
 }
 
 /// Shows a skin until `stop` is set. Calls `is_served` once pages can connect.
@@ -83,8 +90,17 @@ pub fn serve(
     stop: &AtomicBool,
     is_served: impl FnOnce(),
 ) -> Result<ServerCounts, ServeError> {
-    let ServeOptions { skin, surface, kinds, directory, listener, access, waits_for_buses: patient, bench } =
-        options;
+    let ServeOptions {
+        skin,
+        surface,
+        kinds,
+        directory,
+        listener,
+        access,
+        waits_for_buses: patient,
+        bench,
+        foxglove,
+    } = options;
     let may_act = access.may_act;
     let opener = BusOpener { kinds: &kinds, directory: directory.as_deref() };
     let buses = skin.buses.iter().map(|bus| FollowedBus::open(bus, opener, patient));
@@ -93,6 +109,9 @@ pub fn serve(
     let scene = Scene { shells, ..Scene::from_skin(&skin, may_act) };
     let scene = serde_json::to_string(&scene).unwrap_or_default();
     let server = Server::start(listener, access, scene, corners).map_err(ServeError::Server)?;
+    let viewers =
+        foxglove.map(|options| serve_viewers(options, &skin)).transpose().map_err(ServeError::Viewers)?;
+    let viewers = viewers.as_ref().map(|(_, topics)| topics);
     is_served();
     let live = Mutex::new(LiveState::new(skin));
     thread::scope(|scope| {
@@ -101,12 +120,20 @@ pub fn serve(
             let receive = move || {
                 bus.receive(opener, FRAME_GATHER_TIME, stop, |follower| {
                     let mut live = lock_ignoring_poison(live);
+                    let mut viewers = viewers.map(lock_ignoring_poison);
                     follower.for_each_item(|item| {
                         if let FollowedItem::Frame(received) = item {
                             live.apply_frame(index, Micros(received.at_nanos / 1_000), &received.frame);
+                            if let Some(topics) = &mut viewers {
+                                topics.publish_frame(index, received.at_nanos, &received.frame);
+                            }
                         }
                     });
-                    live.set_bus_state(index, !follower.is_lost(), follower.dropped_frames());
+                    let dropped = follower.dropped_frames();
+                    live.set_bus_state(index, !follower.is_lost(), dropped);
+                    if let Some(topics) = &mut viewers {
+                        topics.publish_state(index, &live, dropped);
+                    }
                 });
             };
             if let Err(error) = thread::Builder::new().spawn_scoped(scope, receive) {
@@ -114,17 +141,26 @@ pub fn serve(
                 return Err(ServeError::Thread(error));
             }
         }
-        publish_and_execute(&live, &buses, &server, bench, stop);
+        publish_and_execute(&live, &buses, (&server, viewers), bench, stop);
         Ok(())
     })?;
     Ok(server.counts())
+}
+
+/// Starts the server of viewers. Returns it with the topics that it sends.
+fn serve_viewers(options: FoxgloveOptions, skin: &Skin) -> io::Result<(FoxgloveServer, Mutex<LiveTopics>)> {
+    let FoxgloveOptions { listener, token, robot } = options;
+    let name = format!("skinbus, live: {}", skin.name);
+    let server = FoxgloveServer::start(listener, token, name, false)?;
+    let topics = LiveTopics::new(&server, skin, robot)?;
+    Ok((server, Mutex::new(topics)))
 }
 
 /// Sends snapshots to the pages, and passes their commands to the buses and to the bench.
 fn publish_and_execute(
     live: &Mutex<LiveState>,
     buses: &[FollowedBus],
-    server: &Server,
+    (server, viewers): (&Server, Option<&Mutex<LiveTopics>>),
     mut bench: Option<JsonPipe>,
     stop: &AtomicBool,
 ) {
@@ -160,6 +196,9 @@ fn publish_and_execute(
         let due = {
             let mut live = lock_ignoring_poison(live);
             live.handle_time(now);
+            if let Some(topics) = viewers {
+                lock_ignoring_poison(topics).publish_diagnostics(&live);
+            }
             let due = pressed.due_stimuli(now, |cell| live.latched_sensors(cell, now));
             if server.page_count() > 0 {
                 let snapshot = live.snapshot(now, &pressed);

@@ -4,10 +4,10 @@
 //! this server, and carries the token if there is one. Each page then has a thread, which sends it the newest snapshot
 //! whenever the page can receive one. A slow page therefore delays no other.
 
-mod answer;
-mod door;
-mod page;
-mod request;
+pub(crate) mod answer;
+pub(crate) mod door;
+pub(crate) mod page;
+pub(crate) mod request;
 
 use std::collections::BTreeMap;
 use std::io;
@@ -19,6 +19,9 @@ use std::thread;
 
 use tungstenite::{Bytes, Utf8Bytes};
 
+use self::answer::{HttpResponse, RefusalReason};
+use self::door::DoorKeeper;
+use self::page::PrefixedStream;
 use crate::lock_ignoring_poison;
 use crate::page_command::{PageCommand, SelectedCell};
 use crate::token::Token;
@@ -85,6 +88,32 @@ struct ServerState {
     ignored: AtomicU64,
 }
 
+impl DoorKeeper for ServerState {
+    const MAX_CLIENTS: usize = MAX_PAGES;
+    const FULL: RefusalReason = RefusalReason::Full;
+    const THREAD_NAME: &'static str = "view page";
+
+    fn is_stopped(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
+
+    fn count_refusal(&self) {
+        self.refused.fetch_add(1, Ordering::Relaxed);
+    }
+
+    fn served(&self) -> &AtomicUsize {
+        &self.pages
+    }
+
+    fn answer(&self, head: &[u8]) -> Option<HttpResponse> {
+        answer::answer_request(head, self)
+    }
+
+    fn serve(&self, begun: PrefixedStream, number: u64) {
+        page::serve_page(begun, number, self);
+    }
+}
+
 /// A running server. Dropping it stops its threads.
 #[derive(Debug)]
 pub struct Server {
@@ -126,8 +155,8 @@ impl Server {
         let (pages, begun) = channel();
         let of_pages = Arc::clone(&shared);
         let named = |name: &str| thread::Builder::new().name(name.to_owned());
-        named("view pages").spawn(move || door::start_page_threads(begun, &of_pages))?;
-        named("view door").spawn(move || door::serve_clients(&listener, &shared, &pages))?;
+        named("view pages").spawn(move || door::start_client_threads(begun, &of_pages))?;
+        named("view door").spawn(move || door::serve_clients(&listener, &*shared, &pages))?;
         Ok(server)
     }
 

@@ -33,6 +33,7 @@ mod summary;
 pub mod sums;
 pub mod test_client;
 pub mod vcan;
+pub mod viewer;
 pub mod whole;
 
 use std::collections::BTreeSet;

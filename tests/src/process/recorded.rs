@@ -115,12 +115,20 @@ fn line(message: &Message) -> String {
     format!("({seconds}.{micros:06}) {bus} {id}#{body}")
 }
 
+/// Decodes a message by the definition of its type.
+pub fn decode(definition: &str, message: &[u8]) -> Value {
+    Types::from_definition(definition).decode(message)
+}
+
 /// The types of a schema, by name; the main one has an empty name.
 struct Types(BTreeMap<String, Vec<(String, String)>>);
 
 impl Types {
     fn from_schema(schema: &Schema<'_>) -> Self {
-        let text = str::from_utf8(&schema.data).unwrap();
+        Self::from_definition(str::from_utf8(&schema.data).unwrap())
+    }
+
+    fn from_definition(text: &str) -> Self {
         let mut types = BTreeMap::new();
         for part in text.split(&"=".repeat(80)) {
             let part = part.trim_start();

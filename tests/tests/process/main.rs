@@ -35,5 +35,6 @@ mod process_sums;
 mod process_timed;
 mod process_view;
 mod process_view_bench;
+mod process_view_foxglove;
 mod process_view_recording;
 mod serve;

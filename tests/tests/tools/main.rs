@@ -3,6 +3,7 @@
 mod tools_captures;
 mod tools_chains;
 mod tools_dbc;
+mod tools_foxglove;
 mod tools_man;
 mod tools_power_loss;
 mod tools_recording;

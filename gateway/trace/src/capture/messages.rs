@@ -271,7 +271,15 @@ impl MessageReader {
                 });
                 self.numbers.channels.insert(id, index);
             }
-            _ => {}
+            Record::Schema { .. }
+            | Record::Channel { .. }
+            | Record::Header { .. }
+            | Record::Message { .. }
+            | Record::Attachment { .. }
+            | Record::Metadata { .. }
+            | Record::Footer { .. }
+            | Record::DataEnd { .. }
+            | Record::Other => {}
         }
         Ok(())
     }

@@ -12,15 +12,15 @@ const CONTENT_SECURITY_POLICY: &str = "default-src 'none'; script-src 'self'; st
 
 /// A complete HTTP answer.
 #[derive(Debug)]
-pub(super) struct HttpResponse {
-    pub(super) bytes: Vec<u8>,
+pub(crate) struct HttpResponse {
+    pub(crate) bytes: Vec<u8>,
     /// True if the client has sent the token, or if none is needed.
-    pub(super) is_known: bool,
+    pub(crate) is_known: bool,
 }
 
 /// The reason why a request is refused.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum RefusalReason {
+pub(crate) enum RefusalReason {
     /// The request is not a GET request of HTTP/1.1.
     Malformed,
     /// The request is addressed to another host, or comes from a page of another site.
@@ -39,6 +39,14 @@ pub(super) enum RefusalReason {
     Crowded,
     /// The maximum number of pages is connected.
     Full,
+    /// A viewer's request is addressed to another host, or comes from a page of a site that is not known as a viewer.
+    ViewerElsewhere,
+    /// A viewer's request does not carry the right token.
+    ViewerUnknown,
+    /// The address of the viewers' WebSocket was requested like a file.
+    NoViewer,
+    /// The maximum number of viewers is connected.
+    ViewersFull,
 }
 
 impl RefusalReason {
@@ -65,13 +73,31 @@ impl RefusalReason {
             Self::Full => {
                 ("503 Service Unavailable", "16 pages are open, the maximum: close one and try again")
             }
+            Self::ViewerElsewhere => (
+                "403 Forbidden",
+                "wrong host or origin: connect to the address printed after `foxglove:`; a viewer on another \
+                 site needs a token, see --token-file",
+            ),
+            Self::ViewerUnknown => (
+                "403 Forbidden",
+                "the token is missing or outdated: connect to the address printed after `foxglove:`, with \
+                 ?token=...",
+            ),
+            Self::NoViewer => (
+                "426 Upgrade Required",
+                "this address accepts only a WebSocket: connect to it in Foxglove or Lichtblick",
+            ),
+            Self::ViewersFull => (
+                "503 Service Unavailable",
+                "32 viewers are connected, the maximum: disconnect one and try again",
+            ),
         }
     }
 }
 
 impl HttpResponse {
     /// Returns the answer for a request that is refused.
-    pub(super) fn from_refusal(why: RefusalReason) -> Self {
+    pub(crate) fn from_refusal(why: RefusalReason) -> Self {
         let (status, words) = why.status_and_advice();
         let number = status.split(' ').next().unwrap_or_default();
         Self::new(status, "text/plain; charset=utf-8", format!("{number}: {words}\n").as_bytes(), false)

@@ -1,5 +1,5 @@
-//! The door of the server: one thread that reads and answers the requests of all clients. It passes clients that become
-//! pages on to their own threads.
+//! The door of a server: one thread that reads and answers the requests of all clients. It passes clients that become
+//! pages or viewers on to their own threads.
 //!
 //! A client must send the whole head of its request within [`HEAD_TIMEOUT`]. If too many clients wait, the one that has
 //! waited longest is refused. A client with the token sends its head at once and is answered before that, so clients
@@ -8,7 +8,7 @@
 use std::io::{ErrorKind, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, Sender};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -16,10 +16,9 @@ use std::time::{Duration, Instant};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::{Resource, getrlimit, setpriority_process};
 
-use super::answer::{HttpResponse, RefusalReason, answer_request};
-use super::page::{self, PrefixedStream};
+use super::answer::{HttpResponse, RefusalReason};
+use super::page::PrefixedStream;
 use super::request::MAX_HEAD_BYTES;
-use super::{MAX_PAGES, ServerState};
 
 /// The time within which a client must send the head of its request, and must receive the answer.
 const HEAD_TIMEOUT: Duration = Duration::from_secs(5);
@@ -39,6 +38,27 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 const THREAD_NICENESS: i32 = 10;
 /// The maximum number of bytes that are read at once.
 const READ_CHUNK_BYTES: usize = 4 * 1024;
+
+/// A server whose clients come in by the door.
+pub(crate) trait DoorKeeper: Send + Sync + 'static {
+    /// The maximum number of clients that are served at the same time.
+    const MAX_CLIENTS: usize;
+    /// The reason for which further ones are refused.
+    const FULL: RefusalReason;
+    /// The beginning of the names of the clients' threads.
+    const THREAD_NAME: &'static str;
+
+    /// Returns true once the server ends.
+    fn is_stopped(&self) -> bool;
+    /// Counts a request that is refused.
+    fn count_refusal(&self);
+    /// Returns the number of clients that are served now.
+    fn served(&self) -> &AtomicUsize;
+    /// Answers a request with this head. Returns `None` if the client is to be served by a thread of its own.
+    fn answer(&self, head: &[u8]) -> Option<HttpResponse>;
+    /// Serves a client until it disconnects.
+    fn serve(&self, begun: PrefixedStream, number: u64);
+}
 
 /// A client that has not received its answer yet.
 #[derive(Debug)]
@@ -61,13 +81,17 @@ enum ClientNextStep {
 }
 
 /// Serves clients until the server stops. Passes clients that become pages to `pages`.
-pub(super) fn serve_clients(listener: &TcpListener, shared: &ServerState, pages: &Sender<PrefixedStream>) {
+pub(crate) fn serve_clients(
+    listener: &TcpListener,
+    shared: &impl DoorKeeper,
+    pages: &Sender<PrefixedStream>,
+) {
     // On Linux, niceness applies to the thread alone. If it cannot be set, the door works without it.
     let _ = setpriority_process(None, THREAD_NICENESS);
     let room = pending_client_limit();
     let mut visitors = Vec::<PendingClient>::new();
     let mut resting = None::<Instant>;
-    while !shared.stop.load(Ordering::Relaxed) {
+    while !shared.is_stopped() {
         resting = resting.filter(|end| Instant::now() < *end);
         let ready = wait_until_ready(listener, resting.is_none(), &visitors);
         let [listener_is_ready, rest @ ..] = ready.as_slice() else { continue };
@@ -75,7 +99,7 @@ pub(super) fn serve_clients(listener: &TcpListener, shared: &ServerState, pages:
         // Clients whose data has arrived are served before new clients can push them out.
         for (visitor, is_ready) in std::mem::take(&mut visitors).into_iter().zip(rest) {
             if now >= visitor.until {
-                shared.refused.fetch_add(1, Ordering::Relaxed);
+                shared.count_refusal();
                 // Browsers open connections before they need them, and would take this text for the answer to a later
                 // request.
                 if !visitor.head.is_empty() {
@@ -151,29 +175,29 @@ fn apply_next_step(next: ClientNextStep, visitors: &mut Vec<PendingClient>, page
     }
 }
 
-/// Starts a thread for each new page, up to the maximum number. These threads have normal priority.
-pub(super) fn start_page_threads(pages: Receiver<PrefixedStream>, shared: &Arc<ServerState>) {
-    for (page, begun) in (1..).zip(pages) {
-        if shared.pages.fetch_add(1, Ordering::Relaxed) >= MAX_PAGES {
-            shared.pages.fetch_sub(1, Ordering::Relaxed);
-            shared.refused.fetch_add(1, Ordering::Relaxed);
-            PendingClient::new(begun.into_stream()).refuse(RefusalReason::Full);
+/// Starts a thread for each new client, up to the maximum number. These threads have normal priority.
+pub(crate) fn start_client_threads<K: DoorKeeper>(clients: Receiver<PrefixedStream>, shared: &Arc<K>) {
+    for (number, begun) in (1..).zip(clients) {
+        if shared.served().fetch_add(1, Ordering::Relaxed) >= K::MAX_CLIENTS {
+            shared.served().fetch_sub(1, Ordering::Relaxed);
+            shared.count_refusal();
+            PendingClient::new(begun.into_stream()).refuse(K::FULL);
             continue;
         }
         let of_thread = Arc::clone(shared);
-        let started = thread::Builder::new().name(format!("view page {page}")).spawn(move || {
-            page::serve_page(begun, page, &of_thread);
-            of_thread.pages.fetch_sub(1, Ordering::Relaxed);
+        let started = thread::Builder::new().name(format!("{} {number}", K::THREAD_NAME)).spawn(move || {
+            of_thread.serve(begun, number);
+            of_thread.served().fetch_sub(1, Ordering::Relaxed);
         });
         if started.is_err() {
-            shared.pages.fetch_sub(1, Ordering::Relaxed);
-            shared.refused.fetch_add(1, Ordering::Relaxed);
+            shared.served().fetch_sub(1, Ordering::Relaxed);
+            shared.count_refusal();
         }
     }
 }
 
 /// Refuses the visitor that has waited longest. Visitors that have sent the token are spared as long as possible.
-fn refuse_oldest_client(visitors: &mut Vec<PendingClient>, shared: &ServerState) {
+fn refuse_oldest_client(visitors: &mut Vec<PendingClient>, shared: &impl DoorKeeper) {
     let is_known =
         |visitor: &PendingClient| visitor.answer.as_ref().is_some_and(|(answer, _)| answer.is_known);
     let at = visitors.iter().position(|visitor| !is_known(visitor)).unwrap_or(0);
@@ -181,7 +205,7 @@ fn refuse_oldest_client(visitors: &mut Vec<PendingClient>, shared: &ServerState)
         return;
     }
     let oldest = visitors.remove(at);
-    shared.refused.fetch_add(1, Ordering::Relaxed);
+    shared.count_refusal();
     if oldest.answer.is_none() {
         oldest.refuse(RefusalReason::Crowded);
     }
@@ -193,7 +217,7 @@ impl PendingClient {
     }
 
     /// Reads the data that has arrived from a visitor, and sends as much of the answer as the socket accepts.
-    fn read_and_answer(mut self, shared: &ServerState) -> ClientNextStep {
+    fn read_and_answer(mut self, shared: &impl DoorKeeper) -> ClientNextStep {
         while self.answer.is_none() {
             let mut piece = [0; READ_CHUNK_BYTES];
             // The empty line that ends the head may begin in the last three bytes that were read before.
@@ -208,10 +232,10 @@ impl PendingClient {
             let new = self.head.get(seen..).unwrap_or_default();
             let end = new.windows(4).position(|end| end == b"\r\n\r\n").map(|at| seen + at + 4);
             if self.head.len() > MAX_HEAD_BYTES {
-                shared.refused.fetch_add(1, Ordering::Relaxed);
+                shared.count_refusal();
                 self.answer = Some((HttpResponse::from_refusal(RefusalReason::Long), 0));
             } else if let Some(head) = end.and_then(|end| self.head.get(..end)) {
-                match answer_request(head, shared) {
+                match shared.answer(head) {
                     Some(answer) => self.answer = Some((answer, 0)),
                     None => return ClientNextStep::Page(PrefixedStream::new(self.head, self.stream)),
                 }

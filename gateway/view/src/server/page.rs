@@ -21,18 +21,22 @@ const MAX_MESSAGES_AT_ONCE: usize = 64;
 
 /// A stream whose first bytes, the head of a request, were already read.
 #[derive(Debug)]
-pub(super) struct PrefixedStream {
+pub(crate) struct PrefixedStream {
     head: Cursor<Vec<u8>>,
     stream: TcpStream,
 }
 
 impl PrefixedStream {
-    pub(super) const fn new(head: Vec<u8>, stream: TcpStream) -> Self {
+    pub(crate) const fn new(head: Vec<u8>, stream: TcpStream) -> Self {
         Self { head: Cursor::new(head), stream }
     }
 
-    pub(super) fn into_stream(self) -> TcpStream {
+    pub(crate) fn into_stream(self) -> TcpStream {
         self.stream
+    }
+
+    pub(crate) const fn stream(&self) -> &TcpStream {
+        &self.stream
     }
 }
 

@@ -5,24 +5,24 @@ use std::net::{IpAddr, SocketAddr};
 use crate::token::Token;
 
 /// The maximum length of a head, in bytes.
-pub(super) const MAX_HEAD_BYTES: usize = 8 * 1024;
+pub(crate) const MAX_HEAD_BYTES: usize = 8 * 1024;
 /// The port that is meant if an address has none.
 const DEFAULT_PORT: u16 = 80;
 
 /// The parts of a request that decide how it is answered.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
-pub(super) struct Request {
-    pub(super) path: String,
-    pub(super) query: String,
-    pub(super) host: Option<String>,
-    pub(super) origin: Option<String>,
-    pub(super) is_upgrade: bool,
+pub(crate) struct Request {
+    pub(crate) path: String,
+    pub(crate) query: String,
+    pub(crate) host: Option<String>,
+    pub(crate) origin: Option<String>,
+    pub(crate) is_upgrade: bool,
 }
 
 impl Request {
     /// Parses the head of a request, up to and including the empty line. Returns `None` unless it is a valid GET
     /// request.
-    pub(super) fn parse(head: &str) -> Option<Self> {
+    pub(crate) fn parse(head: &str) -> Option<Self> {
         let mut lines = head.split("\r\n");
         let mut first = lines.next()?.split(' ');
         let (Some("GET"), Some(target), Some("HTTP/1.1")) = (first.next(), first.next(), first.next()) else {
@@ -47,17 +47,23 @@ impl Request {
 
     /// Returns true if the request is addressed to this server by one of its own addresses and does not come from a
     /// page of another site.
-    pub(super) fn is_addressed_to(&self, address: SocketAddr) -> bool {
+    pub(crate) fn is_addressed_to(&self, address: SocketAddr) -> bool {
         let Some(host) = self.host.as_deref().and_then(HostAndPort::parse) else { return false };
         // Browsers send an origin with every WebSocket; other programs may omit it.
         let is_origin = self.origin.as_ref().is_none_or(|origin| {
             origin.strip_prefix("http://").and_then(HostAndPort::parse).is_some_and(|origin| origin == host)
         });
-        host.matches_address(address) && is_origin
+        self.names_host(address) && is_origin
+    }
+
+    /// Returns true if the request names this server by one of its own addresses, whatever page it comes from.
+    pub(crate) fn names_host(&self, address: SocketAddr) -> bool {
+        let host = self.host.as_deref().and_then(HostAndPort::parse);
+        host.is_some_and(|host| host.matches_address(address))
     }
 
     /// Returns true if the request carries the token, or if none is needed.
-    pub(super) fn has_token(&self, token: Option<&Token>) -> bool {
+    pub(crate) fn has_token(&self, token: Option<&Token>) -> bool {
         let Some(token) = token else { return true };
         let given = self.query.split('&').find_map(|part| part.strip_prefix("token="));
         given.is_some_and(|given| token.matches(given))
