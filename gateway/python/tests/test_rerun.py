@@ -37,7 +37,7 @@ class Logged:
             for name in batch.schema.names:
                 column = batch.column(name)
                 # Times in ns have no equal in Python.
-                values = column.cast("int64") if name in ("time", "run") else column
+                values = column.cast("int64") if name in ("time", "run", "log_time") else column
                 columns.setdefault(name, []).extend(values.to_pylist())
 
     @property

@@ -20,6 +20,7 @@ The timeline `time` has the time in UTC, and `run` the time since the first tick
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import subprocess
@@ -102,13 +103,13 @@ def to_rerun(
     """
     stream = _stream(save, recording)
     if isinstance(source, Bench):
-        return LiveLog(source, stream)
+        return LiveLog(source, stream, is_own=recording is None and save is not None)
     paths = [Path(path) for path in (source, *more)]
     with read(*paths, skin=skin, index=False) as recorded:
         _log_epochs(stream, recorded)
         _log_contacts(stream, recorded)
         _log_messages(stream, paths, recorded.began_ns)
-    _finish(stream)
+    _finish(stream, is_own=recording is None and save is not None)
     return stream
 
 
@@ -136,8 +137,11 @@ def _stream(save: PathLike | None, recording: rr.RecordingStream | None) -> rr.R
     return stream
 
 
-def _finish(stream: rr.RecordingStream) -> None:
+def _finish(stream: rr.RecordingStream, *, is_own: bool) -> None:
+    """Writes what is left. Completes the file of a stream that nobody else has."""
     stream.flush()
+    if is_own:
+        stream.disconnect()
 
 
 def _path(*parts: str) -> str:
@@ -277,12 +281,14 @@ class LiveLog:
         stream: The stream that the bench is logged to.
     """
 
-    def __init__(self, bench: Bench, stream: rr.RecordingStream) -> None:
+    def __init__(self, bench: Bench, stream: rr.RecordingStream, *, is_own: bool) -> None:
         self.stream = stream
+        self._is_own = is_own
+        self._stack = contextlib.ExitStack()
         self._began_ns: int | None = None
         self._view = _start_view(bench)
         try:
-            self._socket = _connect(self._view)
+            self._socket = _connect(self._view, self._stack)
             self._topics = dict[int, str]()
             self._threads = [
                 threading.Thread(target=self._follow_topics, name="skinbus to Rerun", daemon=True),
@@ -291,6 +297,7 @@ class LiveLog:
             for thread in self._threads:
                 thread.start()
         except BaseException:
+            self._stack.close()
             self._view.kill()
             self._view.wait()
             raise
@@ -312,7 +319,8 @@ class LiveLog:
             self._view.kill()
             self._view.wait()
         self._threads[0].join(_VIEW_TIMEOUT)
-        _finish(self.stream)
+        self._stack.close()
+        _finish(self.stream, is_own=self._is_own)
 
     def _set_time(self, at_ns: int) -> None:
         if self._began_ns is None:
@@ -417,7 +425,7 @@ def _start_view(bench: Bench) -> subprocess.Popen[str]:
     )
 
 
-def _connect(view: subprocess.Popen[str]) -> _Socket:
+def _connect(view: subprocess.Popen[str], stack: contextlib.ExitStack) -> _Socket:
     """Connects to a view, when it has told its address."""
     from websockets.sync.client import connect
     from websockets.typing import Subprotocol
@@ -430,5 +438,6 @@ def _connect(view: subprocess.Popen[str]) -> _Socket:
         if found is not None:
             # Later lines are read, so that the program never waits for a reader.
             threading.Thread(target=view.stderr.read, daemon=True).start()
-            return connect(found[1], subprotocols=[Subprotocol(_SUBPROTOCOL)], max_size=None)
+            connection = connect(found[1], subprotocols=[Subprotocol(_SUBPROTOCOL)], max_size=None)
+            return stack.enter_context(connection)
     raise SkinbusError(said[-1] if said else "skinbus view ended before it served its topics")
