@@ -1,7 +1,7 @@
 // Connects to `skinbus view --foxglove` with Foxglove's own client, subscribes to all topics, and prints each message as
 // a line of JSON: topic, time, the bytes in base64 and, of joint states, the positions as Foxglove's library reads them.
 //
-//   node tests/tools/foxglove.mjs MODULES URL SECONDS        ends after SECONDS without a new message
+//   node tests/tools/foxglove.mjs MODULES URL SECONDS        ends after SECONDS without a message
 import { createRequire } from "node:module";
 import { join, resolve } from "node:path";
 
@@ -45,5 +45,6 @@ client.on("message", ({ subscriptionId, timestamp, data }) => {
     line.names = value.name;
   }
   console.log(JSON.stringify(line));
-  wait();
+  // Live diagnostics come even if the bench has ended.
+  if (topic !== "/diagnostics") wait();
 });
