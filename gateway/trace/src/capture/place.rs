@@ -14,7 +14,7 @@ pub struct SeekPoint {
     pub(super) offset: u64,
     /// The number of lines before this position in a log; 0 if they were not counted.
     pub(super) line: u64,
-    /// The number of messages of the record at `offset` that come before this position.
+    /// The number of frames and notes of the record at `offset` that come before this position.
     pub(super) skip: u32,
     /// The state of the log's clock at this position.
     pub(super) clock: Clock,

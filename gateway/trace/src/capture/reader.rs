@@ -298,8 +298,13 @@ impl Reader {
                 }
             };
         }
-        for _ in 0..place.skip {
-            self.next_item()?;
+        let mut skip = place.skip;
+        while skip > 0 {
+            match self.next_item()? {
+                Some(RecordingItem::Entry(_)) => skip -= 1,
+                Some(RecordingItem::Other(_)) => {}
+                None => break,
+            }
         }
         Ok(())
     }

@@ -28,7 +28,7 @@ pub(crate) struct McapReader {
     /// The first requested message, or the error before it. It is read when the recording is opened.
     first: Option<Result<RequestedMessage, ReadFault>>,
     /// The offset of the record that holds the next message (a chunk or the message itself), and the number of its
-    /// messages that were already returned.
+    /// frames and notes that were already returned.
     anchor: (u64, u32),
     /// The file, if it can be read at other offsets.
     file: Option<File>,
@@ -103,8 +103,8 @@ impl McapReader {
         self.state
     }
 
-    /// Returns a position from which the next message can be found: the offset of a record, and the number of messages
-    /// in that record before it. The message may also be in a later record.
+    /// Returns a position from which the next message can be found: the offset of a record, and the number of frames and
+    /// notes in that record before it. The message may also be in a later record.
     pub(crate) const fn resume_point(&self) -> (u64, u32) {
         self.anchor
     }
@@ -138,10 +138,11 @@ impl McapReader {
             None => self.read_to_next_message()?,
         };
         let Some(RequestedMessage { channel, times, in_chunk }) = target else { return Ok(None) };
-        self.anchor.1 += 1;
         let body = if in_chunk { self.chunk.body() } else { self.source.body() };
         let Ok(Record::Message { data, .. }) = parse(op::MESSAGE, body) else { return Ok(None) };
-        Ok(Some(self.state.decode_item(channel, times, data)))
+        let item = self.state.decode_item(channel, times, data);
+        self.anchor.1 += u32::from(matches!(item, RecordingItem::Entry(_)));
+        Ok(Some(item))
     }
 
     /// Reads up to the next requested message.
