@@ -23,6 +23,7 @@
 
 pub mod command;
 pub mod control;
+pub mod curves;
 mod followed;
 pub mod foxglove;
 pub mod index;

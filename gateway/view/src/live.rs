@@ -35,6 +35,21 @@ pub struct LiveState {
     recent: RecentFrames,
 }
 
+/// The contact state of a cell.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CellContact {
+    /// The index of the cell's bus.
+    pub bus: usize,
+    /// The node id of the cell.
+    pub node: CellId,
+    /// True if the cell is touched.
+    pub is_touched: bool,
+    /// True if the cell is dead.
+    pub is_dead: bool,
+    /// The force on the cell in N; `None` if it is unknown or the cell is dead.
+    pub force_n: Option<f64>,
+}
+
 /// The bits that describe a cell in a snapshot.
 mod flag {
     pub(super) const UNCONFIGURED_BIT: u8 = 1;
@@ -108,18 +123,35 @@ impl LiveState {
         self.buses.iter().map(|bus| (bus.loss_count(), bus.halted))
     }
 
-    /// Returns each cell by bus and node id, with two flags: touched and dead. A cell is touched if its sensors show
-    /// it, or if its torque does while the sensor values are unknown.
-    pub fn touched_and_dead_cells(&self, now: Micros) -> impl Iterator<Item = (usize, CellId, [bool; 2])> {
+    /// Returns the contact state of each cell, bus by bus. A cell is touched if its sensors show it, or if its torque
+    /// does while the sensor values are unknown.
+    pub fn cell_contacts(&self, now: Micros) -> impl Iterator<Item = CellContact> {
         self.buses.iter().enumerate().flat_map(move |(index, bus)| {
             let cells = bus.table.cells().iter().zip(bus.table.presumed_sensors(now)).enumerate();
             cells.map(move |(place, (cell, (sensors, status)))| {
                 let is_active = matches!(status, CellStatus::Active | CellStatus::Stale);
-                let touched =
-                    sensors.map_or(is_active, |sensors| bus.central.cell_force(place, &sensors) > 0.0);
-                (index, cell.node, [touched, status == CellStatus::Dead])
+                let is_dead = status == CellStatus::Dead;
+                let force_n = sensors.map(|sensors| bus.central.cell_force(place, &sensors));
+                CellContact {
+                    bus: index,
+                    node: cell.node,
+                    is_touched: force_n.map_or(is_active, |force_n| force_n > 0.0),
+                    is_dead,
+                    force_n: force_n.filter(|_| !is_dead),
+                }
             })
         })
+    }
+
+    /// Returns the load of each bus; `None` before it was measured.
+    pub fn bus_loads(&self) -> impl Iterator<Item = Option<f64>> {
+        self.buses.iter().map(LiveBus::bus_load)
+    }
+
+    /// Returns true if any bus is halted.
+    #[must_use]
+    pub fn is_halted(&self) -> bool {
+        self.buses.iter().any(|bus| bus.halted)
     }
 
     /// Returns two torques for each joint of the robot in the last completed epoch, in Nm or N: the distributed and the

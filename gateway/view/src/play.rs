@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::net::TcpListener;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -10,6 +11,7 @@ use std::time::{Duration, Instant};
 use protocol::skin::Skin;
 use trace::capture::Reader;
 
+use crate::curves::RecordedCurves;
 use crate::foxglove::{FoxgloveOptions, FoxgloveServer, PlayedTopics};
 use crate::index::Progress;
 use crate::live::StatusMessage;
@@ -63,7 +65,7 @@ pub fn play_recording(
 ) -> Result<ServerCounts, ServeError> {
     let PlayOptions { paths, skin, surface, listener, access, at_s, foxglove } = options;
     let mut player = Player::open(&paths, skin.clone())?;
-    let reader = Reader::open_all(&paths).map_err(PlayError::from)?;
+    let reader = Reader::open_with_all_topics(&paths).map_err(PlayError::from)?;
     let (shells, corners) = pack_meshes(&surface);
     let scene =
         serde_json::to_string(&Scene { shells, ..Scene::from_skin(&skin, false) }).unwrap_or_default();
@@ -72,6 +74,7 @@ pub fn play_recording(
     let (_viewers, mut topics) = viewers.unzip();
     is_served();
     let (index, times) = (player.index(), (player.first_frame_ns(), player.time_origin_ns()));
+    server.set_recording(RecordedCurves::new(Arc::clone(&index), skin.clone(), times.1));
     let name = reader.name().to_owned();
     thread::scope(|scope| {
         let (index, name, warns) = (&index, &name, &warns);
@@ -152,10 +155,11 @@ fn publish_and_execute(
             let said = number.is_multiple_of(SNAPSHOTS_PER_STATUS).then(|| {
                 let playback = player.status();
                 if marks.0 != playback.events {
-                    let kinds = [EventKind::Touch, EventKind::Loss, EventKind::Silence, EventKind::Halt];
                     marks = (
                         playback.events,
-                        kinds.map(|kind| (kind, player.parts_with_events(kind, TIMELINE_PARTS))).into(),
+                        EventKind::ALL
+                            .map(|kind| (kind, player.parts_with_events(kind, TIMELINE_PARTS)))
+                            .into(),
                     );
                 }
                 let live = player.live();

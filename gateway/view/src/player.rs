@@ -70,6 +70,8 @@ pub struct PlayerStatus {
     pub exact: bool,
     /// The share of the recording that is indexed, 0 to 1.
     pub read: f64,
+    /// The halt at the position, if the recording contains its reason.
+    pub halt: Option<RecordedHalt>,
     /// The error because of which the recording cannot be read further.
     pub failed: Option<String>,
     /// A description of what is missing at the end of the recording, if it was never finished.
@@ -80,6 +82,15 @@ pub struct PlayerStatus {
     pub events: usize,
     /// By kind of event: the numbers of those of 600 equal parts of the recording in which such events occur.
     pub marks: BTreeMap<EventKind, Vec<u16>>,
+}
+
+/// A halt in a recording.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct RecordedHalt {
+    /// The time at which the halt began, in the same s as the position.
+    pub since_s: f64,
+    /// The reason of the halt.
+    pub reason: String,
 }
 
 impl PlayerStatus {
@@ -393,6 +404,10 @@ impl Player {
             } else {
                 (nanos_to_seconds(read) / nanos_to_seconds(of.max(1))).min(1.0)
             },
+            halt: self
+                .index
+                .halt_reason(self.at)
+                .map(|(since, reason)| RecordedHalt { since_s: self.seconds_since_origin(since), reason }),
             failed: self.failed.clone().or(progress.failed),
             unfinished: progress.unfinished,
             others: progress.others,

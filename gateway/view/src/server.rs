@@ -14,7 +14,7 @@ use std::io;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpListener};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, channel, sync_channel};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, OnceLock};
 use std::thread;
 
 use tungstenite::{Bytes, Utf8Bytes};
@@ -22,6 +22,7 @@ use tungstenite::{Bytes, Utf8Bytes};
 use self::answer::{HttpResponse, RefusalReason};
 use self::door::DoorKeeper;
 use self::page::PrefixedStream;
+use crate::curves::RecordedCurves;
 use crate::lock_ignoring_poison;
 use crate::page_command::{PageCommand, SelectedCell};
 use crate::token::Token;
@@ -77,6 +78,8 @@ struct ServerState {
     scene: String,
     /// The bytes served as `/surface`.
     surface: Vec<u8>,
+    /// The source of `/curves` and `/events`; unset for a live view.
+    recording: OnceLock<RecordedCurves>,
     newest: Mutex<LatestMessages>,
     chosen: Mutex<BTreeMap<u64, SelectedCell>>,
     gone: Mutex<Vec<u64>>,
@@ -141,6 +144,7 @@ impl Server {
             address,
             scene,
             surface,
+            recording: OnceLock::new(),
             newest: Mutex::default(),
             chosen: Mutex::default(),
             gone: Mutex::default(),
@@ -164,6 +168,11 @@ impl Server {
     #[must_use]
     pub fn address(&self) -> SocketAddr {
         self.shared.address
+    }
+
+    /// Sets the recording from which the pages get curves and events. Only the first call has an effect.
+    pub fn set_recording(&self, recording: RecordedCurves) {
+        let _ = self.shared.recording.set(recording);
     }
 
     /// Sends the pages the torques before the next snapshot, for the plots.

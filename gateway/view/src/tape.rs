@@ -17,7 +17,7 @@ use protocol::time::Micros;
 use trace::capture::{CaptureEntry, CaptureError, NoteKind, Reader, RecordingExtras};
 use trace::order::{BusMerger, ReleasedFrame};
 
-pub use self::events::{Event, EventDetector, EventKind};
+pub use self::events::{Event, EventDetector, EventKind, MAX_EVENTS};
 use crate::live::LiveState;
 
 /// The interval in ns at which the passing of time is applied to the state: cells become silent, and loads are
@@ -106,13 +106,18 @@ impl PlaybackState {
     pub fn read_entry(&mut self, reader: &mut Reader) -> Result<(), CaptureError> {
         match reader.next() {
             Ok(Some(entry)) => self.push(&entry),
-            Ok(None) => self.ended = true,
+            Ok(None) => self.end(),
             Err(error) => {
-                self.ended = true;
+                self.end();
                 return Err(error);
             }
         }
         Ok(())
+    }
+
+    /// Marks the tape as ended: the recording has no further entries.
+    pub const fn end(&mut self) {
+        self.ended = true;
     }
 
     /// Stores the frames that were latched when the recording began. Must be called before the first entry is added.
@@ -246,7 +251,9 @@ impl PlaybackState {
         self.foreign_frames
     }
 
-    fn bus_index(&self, name: &str) -> Option<usize> {
+    /// Returns the index of the bus with this name.
+    #[must_use]
+    pub fn bus_index(&self, name: &str) -> Option<usize> {
         self.names.iter().position(|bus| bus == name)
     }
 }

@@ -406,8 +406,8 @@ impl ControlBus {
             .map(|((cell, status), last)| ReportedCell {
                 cell: self.cell_text(cell.node),
                 status: status.name(),
-                epoch: last.map(|(epoch, _)| epoch.0),
-                torque: last.map(|(_, words)| self.real_torque(&words)),
+                epoch: last.map(|(_, epoch, _)| epoch.0),
+                torque: last.map(|(_, _, words)| self.real_torque(&words)),
             })
             .collect()
     }

@@ -49,8 +49,8 @@ pub(crate) struct LiveBus {
     /// The distributed and the central torque of each joint of the chain in the last completed epoch.
     torques: [(f64, f64); MAX_JOINTS],
     joints: usize,
-    /// The last torque of each cell, by the cell's index on the bus.
-    pub(crate) last: Vec<Option<(Epoch, Words)>>,
+    /// The last torque of each cell with its time, by the cell's index on the bus.
+    pub(crate) last: Vec<Option<(Micros, Epoch, Words)>>,
     /// For each cell, the time since which it is dead; `None` for a live cell.
     pub(crate) dead_since: Vec<Option<Micros>>,
     rates: Option<BitRates>,
@@ -107,7 +107,7 @@ impl LiveBus {
             Some(Message::Torque { from, epoch, torque }) => {
                 let place = self.table.index_of(from);
                 if let Some(last) = place.and_then(|place| self.last.get_mut(place)) {
-                    *last = Some((epoch, torque));
+                    *last = Some((at, epoch, torque));
                 }
             }
             Some(Message::Halt) => self.halted = true,

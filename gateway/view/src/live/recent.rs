@@ -15,8 +15,8 @@ use protocol::skin::Skin;
 use protocol::time::Micros;
 use serde::Serialize;
 
-/// The time for which frames are stored, in µs.
-const RETENTION_US: u64 = 3_000_000;
+/// The time for which frames are stored, in µs: longer than a slow page takes to list a frame and to ask about it.
+const RETENTION_US: u64 = 6_000_000;
 /// The maximum number of stored frames.
 const MAX_FRAMES: usize = 65_536;
 /// The maximum number of frames listed for a cell.

@@ -109,6 +109,9 @@ pub struct CellDetail {
     pub serial: u32,
     /// The name of the cell's status.
     pub status: &'static str,
+    /// The time at which the cell was found dead, in s of the run; null unless it is dead. Sensors, force and torque are
+    /// then the last ones.
+    pub dead_at_s: Option<f64>,
     /// The hash of the cell's configuration, and the hash that the skin requires.
     pub configuration: [Option<String>; 2],
     /// The gains and thresholds of the cell, from the skin.
@@ -188,6 +191,8 @@ impl GainsAndThresholds {
 pub struct TorqueReply {
     /// The epoch to which the torque belongs.
     pub epoch: u8,
+    /// The time at which the torque was received, in s of the run.
+    pub at_s: f64,
     /// The torque of each joint as a 16-bit number, as in the packet.
     pub words: Vec<i16>,
     /// The torque of each joint in Nm or N.
@@ -240,7 +245,7 @@ impl LiveState {
         let (sensors, status) = bus.table.presumed_sensors(now).nth(place)?;
         let sensors = sensors.unwrap_or_default();
         let force_n = bus.central.cell_force(place, &sensors);
-        let torque = bus.last.get(place).copied().flatten().map(|(epoch, words)| {
+        let torque = bus.last.get(place).copied().flatten().map(|(received, epoch, words)| {
             let words = words.as_slice();
             let frames = bus.joint_positions_in(epoch).map(|positions| bus.central.link_frames(&positions));
             let joints = self.skin.joints_on_bus(index).len();
@@ -250,6 +255,7 @@ impl LiveState {
             };
             TorqueReply {
                 epoch: epoch.0,
+                at_s: self.seconds_since_start(received),
                 words: words.iter().take(joints).copied().collect(),
                 distributed: words.iter().take(joints).map(|&word| bus.torque_format.to_real(word)).collect(),
                 central: at(force_n),
@@ -265,6 +271,7 @@ impl LiveState {
             node: id.get(),
             serial: cell.serial,
             status: status.name(),
+            dead_at_s: bus.dead_since.get(place).copied().flatten().map(|at| self.seconds_since_start(at)),
             configuration: [
                 cell.heartbeat().map(|it| hash(it.configuration)),
                 Some(hash(cell.configuration)),

@@ -5,6 +5,7 @@ use std::io::Write;
 
 use super::*;
 use crate::command::CellReference;
+use crate::curves::RecordedCurves;
 use crate::live::StatusMessage;
 use crate::page_command::SelectedCell;
 use crate::pressed::TouchRegistry;
@@ -133,7 +134,7 @@ impl Bench {
     }
 
     fn build(&self, player: &Player) {
-        let reader = Reader::open_all(&self.paths).unwrap();
+        let reader = Reader::open_with_all_topics(&self.paths).unwrap();
         player.index().build(
             reader,
             self.skin.clone(),
@@ -163,6 +164,76 @@ fn events_are_found_and_gone_to() {
     assert_eq!(player.parts_with_events(EventKind::Touch, 100), [15, 75]);
     let said = player.status();
     assert!((39.9..40.1).contains(&said.of_s) && said.read == 1.0 && said.others == 0);
+}
+
+#[test]
+fn curves_and_events_of_a_part_are_answered() {
+    let bench = Bench::new();
+    let player = bench.player();
+    bench.build(&player);
+    let curves = RecordedCurves::new(player.index(), bench.skin.clone(), player.time_origin_ns());
+    let ask = |path: &str, query: &str| curves.answer(path, query).map(|(_, bytes)| bytes);
+    let events = ask("/events", "token=x&from=5&to=25.5").unwrap();
+    let events: Vec<serde_json::Value> = serde_json::from_slice(&events).unwrap();
+    let kinds: Vec<_> = events.iter().map(|event| event["kind"].as_str().unwrap()).collect();
+    assert!(kinds.starts_with(&["touch", "loss"]) && kinds.ends_with(&["silence", "halt"]), "{kinds:?}");
+    assert_eq!((&events[0]["bus"], &events[0]["node"]), (&0.into(), &5.into()));
+
+    // Returns the number of quantities, the begin, the length of an interval, and all ranges.
+    let read = |query: &str| {
+        let bytes = ask("/curves", query).unwrap();
+        let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()) as usize;
+        let real = |at: usize| f64::from_le_bytes(bytes[at..at + 8].try_into().unwrap());
+        let values = bytes[24..].chunks(4).map(|value| f32::from_le_bytes(value.try_into().unwrap()));
+        let values: Vec<_> = values.collect();
+        assert_eq!(values.len(), 2 * word(0) * word(4));
+        (word(0), real(8), real(16), values)
+    };
+    let (quantities, from, step, torques) = read("of=torques&from=5&to=7&count=50");
+    assert_eq!(quantities, 18, "three for each joint");
+    assert!(from <= 5.0 && from > 4.9 && (step - 0.04).abs() < 1e-9, "{from} {step}");
+    let least = |values: &[f32]| values.iter().copied().fold(f32::NAN, f32::min);
+    let of_joint = torques.len() / 18;
+    assert_eq!(least(&torques[..of_joint]), 0.0, "the first joint's torque is positive");
+    assert!(least(&torques[3 * of_joint..4 * of_joint]) < 0.0, "the second joint's torque is -200 words");
+    let (_, from, step, force) = read("of=force&cell=vcan0%3A5&from=5&to=7&count=50");
+    let touched = force.chunks(2).position(|range| range[1] > 0.0).unwrap();
+    #[expect(clippy::cast_precision_loss)]
+    let touched = from + step * touched as f64;
+    assert!((5.9..6.1).contains(&touched), "{touched}");
+    let (buses, .., loads) = read("of=loads&from=20&to=21&count=9");
+    assert!(buses == 1 && loads.iter().all(|load| (0.0..1.0).contains(load)), "{loads:?}");
+    let (.., lateness) = read("of=lateness&from=0&to=40&count=9");
+    assert_eq!(lateness, Vec::<f32>::new(), "a log has no lateness");
+    for (path, wrong) in [
+        ("/curves", "of=torques&from=5&to=7"),
+        ("/curves", "of=torques&from=x&to=7&count=9"),
+        ("/curves", "of=torques&from=5&to=inf&count=9"),
+        ("/curves", "of=torques&from=5&to=7&count=5000"),
+        ("/curves", "of=force&from=5&to=7&count=9"),
+        ("/curves", "of=force&cell=vcan9:5&from=5&to=7&count=9"),
+        ("/curves", "of=all&from=5&to=7&count=9"),
+        ("/events", "from=5"),
+    ] {
+        assert_eq!(ask(path, wrong), None, "{path} {wrong}");
+    }
+    assert!(ask("/curves", "of=torques&from=-1e300&to=1e300&count=4096").is_some());
+}
+
+#[test]
+fn notes_of_a_run_are_events() {
+    let mut bytes = log(&skin());
+    bytes.extend(b"# view: kill cell 5 on vcan0\n# the bus 'vcan0' was lost\n# a remark\n");
+    let bench = Bench::of(bytes);
+    let player = bench.player();
+    bench.build(&player);
+    let all = player.index().events_between((0, u64::MAX), 9);
+    let of = |kind| {
+        let events = all.iter().filter(move |event| event.kind == kind);
+        events.map(|event| (event.bus, event.text.as_deref())).collect::<Vec<_>>()
+    };
+    assert_eq!(of(EventKind::Command), [(None, Some("kill cell 5 on vcan0"))]);
+    assert_eq!(of(EventKind::Bus), [(Some(0), Some("lost"))]);
 }
 
 #[test]

@@ -144,6 +144,13 @@ pub(super) fn answer_request(head: &[u8], shared: &ServerState) -> Option<HttpRe
         "/surface" => {
             Some(HttpResponse::new("200 OK", "application/octet-stream", &shared.surface, is_known))
         }
+        path @ ("/curves" | "/events") => {
+            let recording = shared.recording.get();
+            match recording.and_then(|recording| recording.answer(path, &request.query)) {
+                Some((kind, bytes)) => Some(HttpResponse::new("200 OK", kind, &bytes, is_known)),
+                None => turned(RefusalReason::NoFile),
+            }
+        }
         path => match web::media_type_and_contents(path) {
             // A request for a script does not show that the client knows the token.
             Some((kind, bytes)) => Some(HttpResponse::new("200 OK", kind, bytes, is_known && !is_code)),

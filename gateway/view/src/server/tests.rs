@@ -55,6 +55,19 @@ fn page(server: &Server, query: &str) -> Result<WebSocket<TcpStream>, u16> {
 }
 
 #[test]
+fn only_a_recording_has_curves_and_only_with_the_token() {
+    let server = served(Some(TOKEN));
+    let query = "of=lateness&from=0&to=1&count=9";
+    assert_eq!(status(&get(&server, &format!("/curves?{query}&token={TOKEN}"))), "404", "a live view");
+    let skin = protocol::skin::Skin::parse("ur5", include_str!("../../../examples/ur5-253.toml")).unwrap();
+    server.set_recording(RecordedCurves::new(Arc::default(), skin, 0));
+    assert_eq!(status(&get(&server, &format!("/curves?{query}&token={TOKEN}"))), "200");
+    assert_eq!(status(&get(&server, &format!("/events?from=0&to=1&token={TOKEN}"))), "200");
+    assert_eq!(status(&get(&server, &format!("/curves?{query}"))), "403");
+    assert_eq!(status(&get(&server, &format!("/curves?of=all&token={TOKEN}"))), "404");
+}
+
+#[test]
 fn without_the_token_only_the_code_of_the_page_is_served() {
     let server = served(Some(TOKEN));
     for query in
