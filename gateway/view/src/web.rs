@@ -1,7 +1,7 @@
 //! The files of the pages. They are served one by one, or bundled into one script for a page without a server.
 
 /// The files of the live page, and of the page that shows a skin without buses.
-const WEB_FILES: [(&str, &str); 28] = [
+const WEB_FILES: [(&str, &str); 34] = [
     ("index.html", include_str!("../web/index.html")),
     ("still.html", include_str!("../web/still.html")),
     ("style.css", include_str!("../web/style.css")),
@@ -10,12 +10,15 @@ const WEB_FILES: [(&str, &str); 28] = [
     ("bench.js", include_str!("../web/bench.js")),
     ("camera.js", include_str!("../web/camera.js")),
     ("colours.js", include_str!("../web/colours.js")),
+    ("curves.js", include_str!("../web/curves.js")),
     ("dom.js", include_str!("../web/dom.js")),
+    ("events.js", include_str!("../web/events.js")),
     ("frames.js", include_str!("../web/frames.js")),
     ("gl.js", include_str!("../web/gl.js")),
     ("ground.js", include_str!("../web/ground.js")),
     ("halted.js", include_str!("../web/halted.js")),
     ("health.js", include_str!("../web/health.js")),
+    ("lane.js", include_str!("../web/lane.js")),
     ("legend.js", include_str!("../web/legend.js")),
     ("link.js", include_str!("../web/link.js")),
     ("math.js", include_str!("../web/math.js")),
@@ -24,8 +27,11 @@ const WEB_FILES: [(&str, &str); 28] = [
     ("picture.js", include_str!("../web/picture.js")),
     ("plots.js", include_str!("../web/plots.js")),
     ("robot.js", include_str!("../web/robot.js")),
+    ("scale.js", include_str!("../web/scale.js")),
     ("snapshot.js", include_str!("../web/snapshot.js")),
+    ("state.js", include_str!("../web/state.js")),
     ("still.js", include_str!("../web/still.js")),
+    ("strip.js", include_str!("../web/strip.js")),
     ("time.js", include_str!("../web/time.js")),
     ("touch.js", include_str!("../web/touch.js")),
     ("wires.js", include_str!("../web/wires.js")),

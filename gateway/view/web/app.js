@@ -3,7 +3,8 @@
 import { arrows, axesOf, roundUp } from "./arrows.js";
 import { Bench, nameOf } from "./bench.js";
 import { AHEAD_S, Camera } from "./camera.js";
-import { SHOWS, css, isDark, onScheme, ramp } from "./colours.js";
+import { SHOWS, css, isDark, onScheme, ramp, shapeOf } from "./colours.js";
+import { haltReason } from "./halted.js";
 import { hold } from "./frames.js";
 import { axes as axesSeen } from "./ground.js";
 import { Health } from "./health.js";
@@ -12,9 +13,12 @@ import { Link } from "./link.js";
 import { direction, point, project } from "./math.js";
 import { Painter } from "./pace.js";
 import { Picture } from "./picture.js";
-import { Plots, number } from "./plots.js";
-import { TimeBar } from "./time.js";
+import { Plots } from "./plots.js";
 import { cylinders, facing, frames, outline, placed } from "./robot.js";
+import { number } from "./scale.js";
+import { DEAD, cellOf } from "./snapshot.js";
+import { stateOf } from "./state.js";
+import { TimeBar } from "./time.js";
 import { listen, pick } from "./touch.js";
 import { wires } from "./wires.js";
 import * as words from "./words.js";
@@ -23,7 +27,7 @@ const $ = (id) => document.getElementById(id);
 const canvas = $("picture"), camera = new Camera(), health = new Health();
 // What the picture shows of the scene: its outline, its links, its joints' axes; the pose, and the one to expect.
 let parts = [], links = [], turning = [], pose = new Float64Array(), soon = pose, poses = [], drawnAt = 0, jumps = true, most = 1, shownArrows = null;
-let picture = null, scene = null, plots = null, snapshot = null, said = null, all = null, trees = [], chosen = -1, pressed = -1;
+let picture = null, scene = null, plots = null, snapshot = null, said = null, all = null, trees = [], chosen = -1, pressed = -1, awaited = -1, isPressing = false;
 // For browser tests.
 window.skinbus = { frames: 0, snapshots: 0, where, camera, filled: () => filled(), joints: () => snapshot?.joints.map((joint) => joint.position) ?? [] };
 
@@ -46,18 +50,20 @@ const redraw = () => painter.redraw();
 
 function draw(ratio) {
   if (!scene || !snapshot) return { drew: false, worked: false };
-  const news = said;
+  const news = isPressing ? null : said;
   if (news) {
     said = null;
-    health.begin(snapshot.time);
-    health.follow(scene, news.buses);
-    words.say(scene, news, ask);
+    health.begin(snapshot.time, news.playback ? 1 + news.playback.speed : Infinity);
+    const lost = health.follow(scene, news.buses);
+    words.link(stateOf({ connected: true, said: news }));
+    words.say(scene, news, ask, health);
     bench.say(scene, news.bench, chosen);
     trees = news.buses.map((bus) => bus.tree);
     $("tree-switch").hidden = trees.every((tree) => !tree);
     drawTree();
-    plots.draw();
+    plots.say(news, haltReason(news), lost);
   }
+  plots.draw();
   follow();
   picture?.update(snapshot.cells, SHOWS[$("shows").value], chosen);
   point3d();
@@ -148,6 +154,8 @@ function choose(i, turns = true) {
   words.chosen(name(i));
   $("search").value = name(i);
   $("hold").disabled = i < 0 || !scene.may_press;
+  plots.choose(i);
+  if (i >= 0 && snapshot) words.tell(`Cell ${name(i)}: ${shapeOf(cellOf(snapshot.cells, i)).name}, ${forceOf(i)}`);
   link.send(i < 0 ? { do: "unchoose" } : { do: "choose", cell: name(i) });
   redraw();
 }
@@ -155,13 +163,26 @@ function choose(i, turns = true) {
 function press(i, turns = false) {
   choose(i, turns);
   if (!scene.may_press) return;
+  if (pressed !== i) awaited = i;
   pressed = i;
   link.send({ do: "press", cell: name(i), force_n: Number($("force").value) });
 }
 
+const forceOf = (i) => { const { force, status } = cellOf(snapshot.cells, i); return status === DEAD ? "no force known" : `${(force / 1000).toFixed(1)} N`; };
+
+// Tells the result of a press when the cell answers with a force and the joints with torques.
+function answerPress() {
+  if (awaited < 0 || pressed !== awaited || !cellOf(snapshot.cells, awaited).force) return;
+  const torques = snapshot.joints.map(({ distributed }, at) => [Math.abs(distributed), at]), [size, at] = torques.reduce((a, b) => (b[0] > a[0] ? b : a), [0, 0]);
+  if (size < 1e-3) return;
+  words.tell(`Cell ${name(awaited)} is pressed: ${forceOf(awaited)}; the largest torque is ${number(snapshot.joints[at].distributed)} ${scene.joints[at].torque_unit}, of ${scene.joints[at].name}`);
+  awaited = -1;
+}
+
 function release() {
   if (pressed < 0) return;
-  pressed = -1;
+  words.tell(`Cell ${name(pressed)} is released`);
+  pressed = awaited = -1;
   $("hold").setAttribute("aria-pressed", "false");
   link.send({ do: "release" });
 }
@@ -200,9 +221,9 @@ const link = new Link({
     health.forget();
     document.title = `${scene.name}: skinbus view`;
     $("name").textContent = scene.name;
-    plots = new Plots($("torques"), scene.joints);
+    plots = new Plots($("plots"), scene, { seek: (at) => time.go(at), redraw });
     words.chosen("");
-    words.link("connected");
+    words.link(stateOf({}));
     for (const id of ["halt", "resume"]) $(id).disabled = !scene.may_press;
     words.buses(scene);
     picture?.set(scene);
@@ -214,7 +235,8 @@ const link = new Link({
     all = frames(scene, joints);
     placeRobot(joints);
     if (first || jumps && camera.auto && camera.steers) direct(it.cells);
-    plots.push(it.time, it.joints);
+    plots.push(it);
+    answerPress();
     window.skinbus.snapshots++;
     redraw();
   },
@@ -229,7 +251,7 @@ const link = new Link({
   },
   closed(refusal) {
     pressed = -1;
-    words.link(`not connected: ${refusal || "the bench has ended, or is not reachable"}`, true);
+    words.link(stateOf({ connected: false, refusal }));
   },
 });
 
@@ -262,7 +284,8 @@ $("force").oninput = () => {
   $("newtons").textContent = `${Number($("force").value).toFixed(1)} N`;
   if (pressed >= 0) press(pressed);
 };
-$("hold").onclick = () => {
+$("hold").onclick = ({ detail }) => {
+  if (detail > 1) return;
   if (pressed >= 0) return release();
   press(chosen);
   $("hold").setAttribute("aria-pressed", "true");
@@ -272,12 +295,16 @@ $("search").onchange = () => {
   const found = scene ? scene.cells.findIndex((cell, i) => name(i) === text || String(cell.node) === text) : -1;
   $("search").setAttribute("aria-invalid", String(found < 0 && text !== ""));
   if (found >= 0) choose(found);
+  else if (text) words.tell(`There is no cell ${text}: enter bus:node, as ${name(0)}`);
 };
 $("hold-frames").onclick = () => hold($("hold-frames").getAttribute("aria-pressed") !== "true");
 $("halt").onclick = () => link.send({ do: "halt" });
 $("resume").onclick = () => link.send({ do: "resume" });
 window.addEventListener("blur", release);
-window.addEventListener("resize", redraw);
+window.addEventListener("resize", () => { plots?.refresh(); redraw(); });
+// Nothing moves under the pointer while a button is down: what has come is shown after that.
+window.addEventListener("pointerdown", ({ target }) => { isPressing = target.closest?.("button") !== null; });
+for (const end of ["pointerup", "pointercancel", "blur"]) window.addEventListener(end, () => { isPressing = false; redraw(); });
 
 function legend() {
   const shows = SHOWS[$("shows").value];
@@ -297,8 +324,19 @@ $("shows").onchange = legend;
 $("tree").onchange = () => { drawTree(); redraw(); };
 legend();
 shapes($("shapes"), css);
-onScheme(() => {
+function recolour() {
   if (scene) picture?.colours();
   shapes($("shapes"), css);
   legend();
-});
+  time.recolour();
+  plots?.refresh();
+}
+onScheme(recolour);
+// Paper is white.
+for (const [name, is] of [["beforeprint", true], ["afterprint", false]]) {
+  window.addEventListener(name, () => {
+    document.documentElement.classList.toggle("printing", is);
+    time.recolour();
+    if (plots) { plots.refresh(); plots.draw(); }
+  });
+}

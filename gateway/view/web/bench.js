@@ -39,7 +39,8 @@ function write(it, text, className = "") {
 function button(text, onclick) {
   const it = element("button", text);
   it.type = "button";
-  it.onclick = onclick;
+  // The second click of a double click would undo the first one.
+  it.onclick = (event) => { if (event.detail < 2) onclick(); };
   return it;
 }
 
@@ -107,7 +108,8 @@ export class Bench {
     row.append(...this.actions);
     this.links = element("div");
     this.ofCell.append(element("h3", "Process"), this.process, row, this.links);
-    $("cell").after(this.ofCell);
+    // Above what grows and shrinks, so that its buttons stand still.
+    $("cell").before(this.ofCell);
 
     this.buses = scene.buses.map(({ name }) => new Switch(name, `bus ${name}`, (down) => this.send({ do: "bus", bus: name, down })));
     const buses = element("table", undefined, "switches");

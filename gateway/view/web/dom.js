@@ -8,16 +8,16 @@ export function element(tag, text, className) {
 }
 
 // Makes the content of a box equal to these elements, and keeps elements that are equal already: drawing text again is
-// expensive in software, and would remove a user's selection.
+// expensive in software, and would remove a user's selection. What handles events does not belong here: it stays that of before.
 export function show(box, fresh) {
   while (box.childNodes.length > fresh.length) box.lastChild.remove();
   fresh.forEach((it, at) => {
     const old = box.childNodes[at];
     if (!old) return box.append(it);
     if (old.isEqualNode(it)) return;
-    const same = old.nodeName === it.nodeName && old.className === it.className && old.firstElementChild && it.firstElementChild;
-    if (same) show(old, [...it.childNodes]);
-    else old.replaceWith(it);
+    if (old.nodeType !== Node.ELEMENT_NODE || old.nodeName !== it.nodeName || [...old.attributes].some(({ name }) => !it.hasAttribute(name))) return old.replaceWith(it);
+    for (const { name, value } of it.attributes) if (old.getAttribute(name) !== value) old.setAttribute(name, value);
+    show(old, [...it.childNodes]);
   });
 }
 

@@ -1,17 +1,17 @@
 // The newest frames of the chosen cell, decoded, and the explanation of a torque among them.
 
 import { element, show } from "./dom.js";
-import { number } from "./plots.js";
+import { number } from "./scale.js";
 
 const VERDICTS = {
   nearest: "nearest word", saturated: "saturated", rounded: "rounded J", unexplained: "not explained", open: "unknown",
 };
 
 const $ = (id) => document.getElementById(id);
-// The server keeps frames for 3 s. A list under the pointer is renewed only after this time, which is shorter.
+// The server keeps frames for 6 s. A list under the pointer is renewed only after this time, which is shorter.
 const STILL_MS = 2000;
 // The time limit for the explanation of a frame.
-const ANSWER_MS = 1500;
+const ANSWER_MS = 2500;
 // The list stands still while a user reads it or chooses from it.
 let held = false, asked = null, sought = null, renewed = 0;
 // A button has to be under the pointer until it is released, and rows move when new ones come.
@@ -66,7 +66,8 @@ function rowOf(frame, key, ask) {
   const button = element("button", "Why");
   button.type = "button";
   button.setAttribute("aria-label", `Why: explain the torque at ${frame.at_s.toFixed(4)} s`);
-  button.onclick = () => {
+  button.onclick = ({ detail }) => {
+    if (detail > 1) return;
     asked = sought = frame.number;
     hold(true);
     ask(frame.number);
@@ -107,7 +108,7 @@ function explain(why) {
 }
 
 function giveUp() {
-  const words = "No answer: the server keeps frames for 3 s, and this frame may be older. Choose a newer frame.";
+  const words = "No answer: the server keeps frames for 6 s, and this frame may be older. Choose a newer frame.";
   $("why").replaceChildren(element("p", words, "faint"));
   $("why").scrollIntoView({ block: "nearest" });
   hold(false);

@@ -2,16 +2,20 @@
 
 import { css } from "./colours.js";
 import { element } from "./dom.js";
+import { KINDS } from "./events.js";
 
-const KINDS = { touch: "Touch", loss: "Loss", silence: "Silent cell", halt: "Halt" };
 const SPEEDS = [0.05, 0.1, 0.25, 0.5, 1, 2, 5, 10, 20];
 const PARTS = 600;
 
 // Minutes, seconds and thousandths of a time in s; hours if needed. Times before the loop began are negative.
-export function clock(seconds) {
-  const ms = Math.round(Math.abs(seconds) * 1000), two = (v) => String(v).padStart(2, "0");
-  const [h, m, s] = [Math.floor(ms / 3600000), Math.floor(ms / 60000) % 60, Math.floor(ms / 1000) % 60];
-  return `${seconds < 0 && ms > 0 ? "−" : ""}${h ? `${h}:${two(m)}` : m}:${two(s)}.${String(ms % 1000).padStart(3, "0")}`;
+export const clock = (seconds) => moment(seconds, 3);
+
+// The same with another number of digits.
+export function moment(seconds, digits) {
+  const unit = 10 ** digits, all = Math.round(Math.abs(seconds) * unit), two = (v) => String(v).padStart(2, "0");
+  const [h, m, s] = [Math.floor(all / unit / 3600), Math.floor(all / unit / 60) % 60, Math.floor(all / unit) % 60];
+  const part = digits ? `.${String(all % unit).padStart(digits, "0")}` : "";
+  return `${seconds < 0 && all > 0 ? "−" : ""}${h ? `${h}:${two(m)}` : m}:${two(s)}${part}`;
 }
 
 // The position in s that a fragment of the address requests, as in `#at=12.5`; null without one.
@@ -50,6 +54,7 @@ export class TimeBar {
       it.value = kind;
       this.kind.append(it);
     }
+    this.kind.value = "touch";
     const jump = (forward) => () => send({ do: "jump", to: this.kind.value, forward });
     this.last = button("◂", "Previous event", jump(false));
     this.next = button("▸", "Next event", jump(true));
@@ -74,6 +79,18 @@ export class TimeBar {
     window.addEventListener("resize", () => { this.marked = ""; });
   }
 
+  // Draws the events again, in the colours of now.
+  recolour() {
+    this.marked = "";
+    if (this.playback) this.draw();
+  }
+
+  // Pauses at a moment.
+  go(at_s) {
+    this.send({ do: "pause" });
+    this.send({ do: "seek", at_s });
+  }
+
   toggle() {
     const { playing, at_s, from_s, of_s } = this.playback;
     if (playing) return this.send({ do: "pause" });
@@ -85,8 +102,7 @@ export class TimeBar {
   follow() {
     const at = requested(location.hash);
     if (at === null || !this.playback) return;
-    this.send({ do: "pause" });
-    this.send({ do: "seek", at_s: at });
+    this.go(at);
   }
 
   say(playback) {
@@ -97,8 +113,9 @@ export class TimeBar {
     if (!playback) return;
     document.getElementById("press-title").textContent = "Choose";
     if (first) this.follow();
-    this.play.textContent = playback.playing ? "Pause" : "Play";
-    this.play.setAttribute("aria-label", playback.playing ? "Pause" : "Play");
+    const act = playback.playing ? "Pause" : "Play";
+    if (this.play.textContent !== act) this.play.textContent = this.play.title = act;
+    this.play.setAttribute("aria-label", act);
     this.slider.min = String(playback.from_s);
     this.slider.max = String(playback.of_s);
     if (this.dragged === null) this.slider.value = String(playback.at_s);
@@ -129,7 +146,7 @@ export class TimeBar {
     pen.fillStyle = css("--line");
     pen.fillRect(0, 0, w * read, h);
     kinds.forEach((kind, row) => {
-      pen.fillStyle = css(kind === "touch" ? "--distributed" : kind === "loss" ? "--central" : "--alarm");
+      pen.fillStyle = css({ touch: "--distributed", loss: "--central", bus: "--ink", command: "--ink" }[kind] ?? "--alarm");
       for (const part of marks[kind] ?? []) pen.fillRect(part / PARTS * w, row * 4, Math.max(1.5, w / PARTS), 3);
     });
     const said = kinds.filter((kind) => (marks[kind] ?? []).length).map((kind) => KINDS[kind].toLowerCase());

@@ -5,10 +5,13 @@ import { element, show, table } from "./dom.js";
 import { forget, frames } from "./frames.js";
 import { haltedWords } from "./halted.js";
 import { busKey } from "./legend.js";
-import { number } from "./plots.js";
+import { number } from "./scale.js";
+import { clock, moment } from "./time.js";
 
 // With more buses than this, one table has a row for each.
 const FEW_BUSES = 3;
+// A torque is one of now for this time in s.
+const CURRENT_S = 1;
 // Texts for statuses whose names in summaries are not used on the page.
 const STATUSES = { "never heard": "no frame received" };
 const $ = (id) => document.getElementById(id);
@@ -21,10 +24,16 @@ function facts(pairs) {
   }));
 }
 
+// A total, when it has grown last, and a class while that is not long ago.
+function noted(health, names, text) {
+  const { at, style } = health.lately(names);
+  return [at === null ? text : `${text}, last at ${moment(at, 0)}`, style];
+}
+
 const percent = (share) => (share === null || share === undefined ? "–" : `${(share * 100).toFixed(share < 0.1 ? 1 : 0)} %`);
 
 // One row for each bus.
-function many(buses) {
+function many(buses, health) {
   const it = element("table"), head = element("tr");
   for (const text of ["Bus", "Load", "Replies late, missing", "Packets lost, damaged"]) {
     const cell = element("th", text);
@@ -32,47 +41,46 @@ function many(buses) {
     head.append(cell);
   }
   it.className = "buses";
-  it.append(head, ...buses.map((bus) => {
+  it.append(head, ...buses.map((bus, b) => {
     const row = element("tr"), name = element("th", bus.up ? bus.name : `${bus.name}: down`, bus.up ? "" : "bad");
-    const [late, lost] = [[bus.late, bus.missing], [bus.lost + bus.dropped, bus.rejected]];
+    const pairs = [[["late", "missing"], [bus.late, bus.missing]], [["lost", "rejected", "dropped"], [bus.lost + bus.dropped, bus.rejected]]];
     name.scope = "row";
     row.append(name, element("td", percent(bus.load), bus.load > 1 ? "bad" : ""),
-      ...[late, lost].map((pair) => element("td", pair.join(", "), pair.some((n) => n) ? "bad" : "")));
+      ...pairs.map(([names, pair]) => element("td", ...noted(health, names.map((name) => `${b} ${name}`), pair.join(", ")))));
     return row;
   }));
   return it;
 }
 
-export function say(scene, said, ask) {
+export function say(scene, said, ask, health) {
   const sum = (of) => said.buses.reduce((all, bus) => all + of(bus), 0);
   const [due, complete] = [sum((bus) => bus.epochs_due), sum((bus) => bus.epochs_complete)];
   facts([
     ["Cells", String(scene.cells.length)],
     ["In contact", String(said.contacts)],
     ["Silent", String(said.dead), said.dead ? "bad" : ""],
-    ["Epochs complete", due ? `${complete} of ${due}` : "–", complete < due ? "bad" : ""],
-    ...(said.halted ? [["Robot", "halted", "bad"]] : []),
+    ["Epochs complete", ...(due ? noted(health, said.buses.map((_, b) => `${b} incomplete`), `${complete} of ${due}`) : ["–"])],
   ]);
   const halted = haltedWords(said, scene.may_press);
   document.body.classList.toggle("halted", halted !== "");
   if ($("halted").textContent !== halted) $("halted").textContent = halted;
   $("halted").hidden = !halted;
-  show($("buses"), said.buses.length > FEW_BUSES ? [many(said.buses)] : said.buses.flatMap((bus) => [
+  show($("buses"), said.buses.length > FEW_BUSES ? [many(said.buses, health)] : said.buses.flatMap((bus, b) => [
     element("h3", bus.up ? bus.name : `${bus.name}: down`, bus.up ? "" : "bad"),
     table([
       ["Load on a real bus", percent(bus.load), bus.load > 1 ? "bad" : ""],
       ["Replies in time", `${bus.in_time} of ${bus.due}`],
-      ["Replies late, missing", `${bus.late}, ${bus.missing}`, bus.late + bus.missing ? "bad" : ""],
-      ["Packets lost, damaged", `${bus.lost}, ${bus.rejected}`, bus.lost + bus.rejected ? "bad" : ""],
-      ["Saturated torques", String(bus.saturated), bus.saturated ? "bad" : ""],
+      ["Replies late, missing", ...noted(health, [`${b} late`, `${b} missing`], `${bus.late}, ${bus.missing}`)],
+      ["Packets lost, damaged", ...noted(health, [`${b} lost`, `${b} rejected`], `${bus.lost}, ${bus.rejected}`)],
+      ["Saturated torques", ...noted(health, [`${b} saturated`], String(bus.saturated))],
       ["Mean error", bus.error_nm === null ? "–" : `${bus.error_nm.toExponential(1)} Nm`],
-      ...(bus.dropped ? [["Frames not read in time", String(bus.dropped), "bad"]] : []),
+      ...(bus.dropped ? [["Frames not read in time", ...noted(health, [`${b} dropped`], String(bus.dropped))]] : []),
     ]),
   ]));
   show($("dead"), [said.dead_cells.length
     ? table(said.dead_cells.map((cell) => [`${cell.bus}:${cell.node}`, `${cell.for_s.toFixed(0)} s`, "bad"]))
     : element("p", "none", "faint")]);
-  if (said.detail) detail(scene, said.detail, ask);
+  if (said.detail) detail(scene, said.detail, ask, health);
 }
 
 // The place of a cell in the skin: in the frame of its row.
@@ -93,29 +101,33 @@ function reading({ name, unit, decimals, values }) {
   return [unit ? `${title}, ${unit}` : title, values.map((v) => v.toFixed(decimals).replace("-", "−")).join(", ")];
 }
 
-function detail(scene, it, ask) {
+function detail(scene, it, ask, health) {
   const joints = scene.chains[scene.buses[it.bus].chain].rows.filter((row) => row.joint !== null).map((row) => scene.joints[row.joint]);
   const wrong = it.configuration[0] !== null && it.configuration[0] !== it.configuration[1];
+  const dead = it.dead_at_s !== null && it.dead_at_s !== undefined, silent = dead || it.status === "never heard";
+  const lost = `${it.bus}:${it.node} lost`;
+  health.count(lost, it.lost);
+  const values = [["Force", `${it.force_n.toFixed(3)} N`], ...it.readings.map(reading)];
   const rows = [
-    ["Status", STATUSES[it.status] ?? it.status, it.status === "dead" || it.status === "stale" ? "bad" : ""],
+    ["Status", dead ? `dead since ${moment(it.dead_at_s, 1)}` : STATUSES[it.status] ?? it.status, it.status === "dead" || it.status === "stale" ? "bad" : ""],
     ["Serial number", String(it.serial)],
     ...where(scene, it),
     ["Configuration", wrong ? it.configuration.join(", expected ") : it.configuration[1], wrong ? "bad" : ""],
     ["Gains α: contact, proximity", it.gains.alpha.map(String).join(", ") + " N"],
     ["Thresholds: contact, proximity, force",
       it.gains.thresholds.map((value, at) => `${Number(value.toPrecision(3))}${[" N", "", " N"][at]}`).join(", ")],
-    ["Force", `${it.force_n.toFixed(3)} N`],
-    ...it.readings.map(reading),
+    ...(silent ? [] : values),
     ["Replies in time", `${it.replies[1]} of ${it.replies[0]}`],
-    ["Packets lost, restarts", `${it.lost}, ${it.restarts}`, it.lost ? "bad" : ""],
+    ["Packets lost, restarts", ...noted(health, [lost], `${it.lost}, ${it.restarts}`)],
   ];
   const parts = [table(rows)];
+  // Nothing of a cell that is silent stands as if it were so now.
+  if (dead) parts.push(element("h3", `Last values, before ${moment(it.dead_at_s, 1)}`), table(values.map(([name, value]) => [name, value, "faint"])));
   if (it.torque) {
     const units = [...new Set(joints.map((joint) => joint.torque_unit))];
     const head = element("tr");
     head.append(...["Joint", "word", "cell", "central", "error", "J"].map((text, i) => element(i ? "td" : "th", text, "faint")));
     const torques = element("table");
-    torques.className = "torques";
     torques.append(head);
     it.torque.words.forEach((word, at) => {
       const row = element("tr"), joint = joints[at] || { name: String(at + 1), torque_unit: "" };
@@ -127,7 +139,10 @@ function detail(scene, it, ask) {
         element("td", it.torque.jacobian ? number(it.torque.jacobian[at]) : "–"));
       torques.append(row);
     });
-    parts.push(element("h3", `Torque of epoch ${it.torque.epoch}${units.length > 1 ? "" : `, ${units[0]}`}${it.torque.saturated ? ", saturated" : ""}`), torques);
+    const current = !dead && (it.torque.at_s === undefined || health.time - it.torque.at_s < CURRENT_S);
+    torques.className = current ? "torques" : "torques faint";
+    const when = current || it.torque.at_s === undefined ? "" : `, the last one, at ${clock(it.torque.at_s)}`;
+    parts.push(element("h3", `Torque of epoch ${it.torque.epoch}${when}${units.length > 1 ? "" : `, ${units[0]}`}${it.torque.saturated ? ", saturated" : ""}`), torques);
   }
   show($("cell"), parts);
   frames(it.frames, it.why, ask);
@@ -135,13 +150,18 @@ function detail(scene, it, ask) {
 
 export function chosen(name) {
   $("cell-title").textContent = name ? `Cell ${name}` : "No cell chosen";
-  if (!name) $("cell").replaceChildren();
+  $("cell").replaceChildren();
   forget();
 }
 
-export function link(text, isBad) {
-  $("link").textContent = text;
-  $("link").className = isBad ? "bad" : "";
+export function link({ word, text }) {
+  if ($("link").textContent !== text) $("link").textContent = text;
+  $("link").className = `is-${word}`;
+}
+
+// Tells readers who do not see the page what an action has done.
+export function tell(text) {
+  $("results").textContent = text;
 }
 
 // The colours of the buses; buses that share a colour are in one line.

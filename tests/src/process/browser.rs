@@ -96,6 +96,13 @@ impl Browser {
 
     /// Calls a method of the DevTools protocol, and returns its result.
     pub fn call(&mut self, method: &str, parameters: &Value) -> Value {
+        let answer = self.try_call(method, parameters);
+        assert!(answer["error"].is_null(), "{method}: {answer}");
+        answer["result"].clone()
+    }
+
+    /// Calls a method that may fail, for example because its element does not exist any more. Returns the answer.
+    pub fn try_call(&mut self, method: &str, parameters: &Value) -> Value {
         self.number += 1;
         let message = json!({ "id": self.number, "method": method, "params": parameters });
         self.socket.send(Message::text(message.to_string())).unwrap();
@@ -103,8 +110,7 @@ impl Browser {
             let Message::Text(text) = self.socket.read().unwrap() else { continue };
             let answer: Value = serde_json::from_str(text.as_str()).unwrap();
             if answer["id"] == self.number {
-                assert!(answer["error"].is_null(), "{method}: {answer}");
-                return answer["result"].clone();
+                return answer;
             }
             self.events.push(answer);
         }
@@ -137,6 +143,15 @@ impl Browser {
         let event =
             json!({ "type": kind, "x": x, "y": y, "button": "left", "buttons": buttons, "clickCount": 1 });
         self.call("Input.dispatchMouseEvent", &event);
+    }
+
+    /// Presses the left button of the mouse for a time. `count` is 2 for the second click of a double click.
+    pub fn click_for(&mut self, [x, y]: [f64; 2], count: u8, time: Duration) {
+        for (kind, buttons) in [("mousePressed", 1), ("mouseReleased", 0)] {
+            let event = json!({ "type": kind, "x": x, "y": y, "button": "left", "buttons": buttons, "clickCount": count });
+            self.call("Input.dispatchMouseEvent", &event);
+            std::thread::sleep(time);
+        }
     }
 
     pub fn key(&mut self, kind: &str, key: &str) {

@@ -19,9 +19,13 @@ use process::log::Log;
 use process::page::{address, watched};
 use protocol::can::Format;
 use protocol::message::{Message, SensorPage};
+use serde_json::json;
 
 /// The rules of accessibility and the checker for them.
 const AXE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../target/axe/node_modules/axe-core/axe.min.js");
+
+/// A script that finds texts with too little contrast.
+const CONTRAST: &str = include_str!("../../tools/contrast.js");
 
 /// Returns the serious and critical findings of axe-core, which is loaded into the page.
 fn findings(browser: &mut Browser) -> Vec<String> {
@@ -43,6 +47,28 @@ fn is_accessible(browser: &mut Browser) {
         browser.scheme(scheme);
         browser.until(&format!("document.documentElement.scrollWidth <= {width}"));
         assert_eq!(findings(browser), Vec::<String>::new(), "{width} px, {scheme}");
+        has_contrast(browser, &format!("{width} px, {scheme}"));
+    }
+}
+
+/// Checks the contrast of every text, with all buttons as they are, under the pointer, and pressed.
+fn has_contrast(browser: &mut Browser, place: &str) {
+    browser.call("DOM.enable", &json!({}));
+    browser.call("CSS.enable", &json!({}));
+    for state in [json!([]), json!(["hover"]), json!(["hover", "active"])] {
+        let root = browser.call("DOM.getDocument", &json!({ "depth": 0 }))["root"]["nodeId"].clone();
+        let query = json!({ "nodeId": root, "selector": "button, select, summary" });
+        let nodes = browser.call("DOM.querySelectorAll", &query)["nodeIds"].as_array().unwrap().clone();
+        assert!(!nodes.is_empty());
+        // Labels of events come and go, so a node may not exist any more.
+        for node in &nodes {
+            let forced = json!({ "nodeId": node, "forcedPseudoClasses": state });
+            browser.try_call("CSS.forcePseudoState", &forced);
+        }
+        assert_eq!(browser.value(CONTRAST), json!([]), "{place}, buttons {state}");
+        for node in &nodes {
+            browser.try_call("CSS.forcePseudoState", &json!({ "nodeId": node, "forcedPseudoClasses": [] }));
+        }
     }
 }
 
@@ -241,6 +267,62 @@ fn a_click_on_why_of_a_moving_list_explains_and_a_halt_says_what_to_press() {
     place.is_left_clean();
 }
 
+/// Clicks of a hand, of 90 ms, single and double, on buttons while everything around them changes.
+#[test]
+#[ignore = "needs tests/tools/install"]
+fn each_click_does_what_its_button_says() {
+    let place = TestDir::new();
+    let (run, address) = watched(&place, 12, "");
+    let mut browser = Browser::new(1400, 900);
+    browser.open(&address.url());
+    browser.until("window.skinbus && window.skinbus.frames > 3");
+    browser.value(
+        "(() => { const it = document.getElementById('search'); it.value = 'vcan0:5'; it.onchange(); })()",
+    );
+    let of_text = |text: &str| {
+        format!(
+            "[...document.querySelectorAll('#side button')].find((it) => it.textContent === '{text}' && !it.disabled)"
+        )
+    };
+    let click = |browser: &mut Browser, text: &str, clicks: u8| {
+        let button = of_text(text);
+        browser.until(&format!("{button}?.scrollIntoView({{ block: 'nearest' }}) === undefined && {button}"));
+        let at = browser.value(&format!(
+            "(() => {{ const b = {button}.getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; }})()"
+        ));
+        let at = [0, 1].map(|axis| at[axis].as_f64().unwrap());
+        browser.mouse("mouseMoved", at);
+        for count in 1..=clicks {
+            browser.click_for(at, count, std::time::Duration::from_millis(90));
+        }
+    };
+    for (first, last) in [("Kill", "Restart"), ("Take down", "Bring up"), ("Hold", "Hold")] {
+        for clicks in [1, 2, 1, 2] {
+            click(&mut browser, first, clicks);
+            browser.until(&match first {
+                "Hold" => {
+                    "document.getElementById('hold').getAttribute('aria-pressed') === 'true'".to_owned()
+                }
+                _ => of_text(last),
+            });
+            // The second click of a double click has changed nothing back.
+            std::thread::sleep(std::time::Duration::from_millis(600));
+            click(&mut browser, last, clicks);
+            browser.until(&match first {
+                "Hold" => {
+                    "document.getElementById('hold').getAttribute('aria-pressed') === 'false'".to_owned()
+                }
+                _ => of_text(first),
+            });
+            std::thread::sleep(std::time::Duration::from_millis(600));
+        }
+    }
+    drop(browser);
+    run.signal(rustix::process::Signal::INT);
+    run.end();
+    place.is_left_clean();
+}
+
 #[test]
 #[ignore = "needs tests/tools/install"]
 fn a_recording_is_gone_through_in_a_browser() {
@@ -287,6 +369,20 @@ fn a_recording_is_gone_through_in_a_browser() {
     browser.until("document.querySelector('#frames button')");
     browser.value("document.querySelector('#frames button').click()");
     browser.until("document.getElementById('why').textContent.includes('nearest')");
+
+    // The curves come from the recording, and a label of an event goes there.
+    browser.until("/^cells .*Nm$/.test(document.querySelector('.lane .values').textContent)");
+    assert_eq!(browser.value("document.getElementById('link').textContent"), "paused");
+    let label = "document.querySelector('.strip button:not(.bare)')";
+    browser.until(label);
+    browser.value(&format!("window.there = /(\\d+\\.\\d+)$/.exec({label}.title)[1]; {label}.click()"));
+    browser.until(&format!("Math.abs({at} - Number(window.there)) < 0.001"));
+    // A plot is read by keyboard.
+    browser.value("document.querySelector('.lane canvas').focus()");
+    browser.key("keyDown", "Home");
+    browser.until(
+        "document.activeElement.getAttribute('aria-valuenow') === document.activeElement.getAttribute('aria-valuemin')",
+    );
     is_accessible(&mut browser);
     is_content(&browser, &url);
     drop(browser);

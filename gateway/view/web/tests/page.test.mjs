@@ -14,7 +14,7 @@ import { Pace, SOFTWARE_HZ } from "../pace.js";
 import { axes, cylinders, facing, frames, neighbors, outline, placed, triangles } from "../robot.js";
 import { cellOf, decode, decodeHistory } from "../snapshot.js";
 import { pick } from "../touch.js";
-import { number } from "../plots.js";
+import { number } from "../scale.js";
 import { clock, requested } from "../time.js";
 import { arms, demo } from "./motions.mjs";
 import { CUT, FLOATS, MOVED, TREE, WIRE, ribbons, wired, wires } from "../wires.js";
