@@ -226,7 +226,10 @@ impl RecordingIndex {
             let mut inner = lock_ignoring_poison(&self.0);
             #[expect(clippy::cast_possible_truncation, reason = "to be drawn")]
             inner.curves.lateness.add(other.nanos, [timing.late_us as f32]);
-            inner.halts.add_tick(other.nanos, &timing);
+            if let Some(reason) = inner.halts.add_tick(other.nanos, &timing) {
+                let (at, kind) = (other.nanos, EventKind::Halt);
+                inner.events.push(Event { at, kind, bus: None, node: None, text: Some(reason) });
+            }
         }
     }
 
@@ -241,7 +244,9 @@ impl RecordingIndex {
         let events = watcher.detect(at, live, &contacts);
         let mut inner = lock_ignoring_poison(&self.0);
         (inner.at, inner.others) = (at, tape.foreign_frame_count());
-        inner.events.extend(events);
+        // A halt of which the loop tells is no other event for its frames.
+        let known = inner.halts.are_known();
+        inner.events.extend(events.into_iter().filter(|event| !known || event.kind != EventKind::Halt));
         let Curves { loads, forces, cells, .. } = &mut inner.curves;
         if cells.is_empty() {
             cells.extend(contacts.iter().map(|cell| (cell.bus, cell.node)));

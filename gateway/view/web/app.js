@@ -53,15 +53,12 @@ function draw(ratio) {
   const news = isPressing ? null : said;
   if (news) {
     said = null;
-    health.begin(snapshot.time, news.playback ? 1 + news.playback.speed : Infinity);
-    const lost = health.follow(scene, news.buses);
     words.link(stateOf({ connected: true, said: news }));
     words.say(scene, news, ask, health);
     bench.say(scene, news.bench, chosen);
     trees = news.buses.map((bus) => bus.tree);
     $("tree-switch").hidden = trees.every((tree) => !tree);
     drawTree();
-    plots.say(news, haltReason(news), lost);
   }
   plots.draw();
   follow();
@@ -246,6 +243,8 @@ const link = new Link({
   },
   said(it) {
     said = it;
+    health.begin(snapshot?.time ?? 0, it.playback ? 1 + it.playback.speed : Infinity);
+    plots.say(it, haltReason(it), health.follow(scene, it.buses));
     time.say(it.playback);
     redraw();
   },

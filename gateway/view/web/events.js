@@ -43,6 +43,8 @@ export class EventLog {
   // Takes in a status message, the reason of a halt, and how many frames were lost since the last message.
   hear({ halted, buses, bench }, why, lost) {
     const time = this.time, before = this.buses, answers = bench?.answers ?? [];
+    // A run whose bus is down knows of a halt before any frame shows it.
+    halted ||= Boolean(bench?.halted);
     if (before) {
       if (halted && !this.halted) this.add(time, "halt", { text: why });
       buses.forEach(({ up }, bus) => { if (up !== before[bus]) this.add(time, "bus", { bus, text: up ? "works again" : "lost" }); });

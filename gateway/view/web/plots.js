@@ -22,7 +22,7 @@ const CALM_MS = 1000;
 export class Plots {
   // `on.seek(at)` goes to a moment of a recording; `on.redraw()` asks for a drawing.
   constructor(box, scene, on) {
-    Object.assign(this, { box, scene, on, span: SPAN_S, view: null, cursor: null, playback: null, now: 0, chosen: -1, health: null, log: new EventLog(), loaded: new Set(), hover: null, dirty: true, asked: false, drawnAt: -Infinity, drawn: "" });
+    Object.assign(this, { box, scene, on, span: SPAN_S, view: null, cursor: null, playback: null, now: 0, chosen: -1, health: null, log: new EventLog(), loaded: new Set(), down: new Set(), hover: null, dirty: true, asked: false, drawnAt: -Infinity, drawn: "" });
     const joints = scene.joints.length, cells = scene.cells.length;
     this.torques = new Recent(2 * joints, MOMENTS);
     this.forces = new Recent(cells, Math.max(300, Math.min(MOMENTS, Math.floor(FORCE_BYTES / 2 / Math.max(1, cells)))), Uint16Array, 1e-3);
@@ -108,7 +108,8 @@ export class Plots {
   push(snapshot) {
     const { time, joints, cells } = snapshot;
     this.now = isBack(time, this.now) ? time : Math.max(time, this.now);
-    this.torques.add(time, joints.flatMap(({ distributed, central }) => [distributed, central]));
+    // The last torques of a joint whose buses are down are none of now.
+    this.torques.add(time, joints.flatMap(({ distributed, central }, at) => (this.down.has(at) ? [NaN, NaN] : [distributed, central])));
     const forces = new Uint16Array(this.scene.cells.length);
     for (let i = 0; i < forces.length; i++) forces[i] = (cells[2 * i] & 255) === 4 ? NO_FORCE : Math.min(NO_FORCE - 1, cells[2 * i] >>> 16);
     this.forces.add(time, forces);
@@ -126,6 +127,9 @@ export class Plots {
     this.lateness.add(this.now, second ? [second.max, second.p99] : [NaN, NaN]);
     const late = this.options.find(({ value }) => value === "lateness");
     late.disabled = !second && !this.playback;
+    const jointsOf = (is) => said.buses.flatMap(({ up }, bus) => (up === is ? this.scene.chains[this.scene.buses[bus].chain].rows.map(({ joint }) => joint) : []));
+    const up = new Set(jointsOf(true));
+    this.down = new Set(jointsOf(false).filter((joint) => !up.has(joint)));
     this.dirty = true;
   }
 
@@ -297,6 +301,12 @@ export class Plots {
         apart = 0;
       });
     }
+    // The whole of a recording, or the present of a bench.
+    canvas.addEventListener("dblclick", () => {
+      const limits = this.limits();
+      this.view = limits ? { from: limits[0], to: limits[1] } : null;
+      this.refresh();
+    });
     canvas.addEventListener("pointerleave", () => { this.hover = null; if (document.activeElement !== canvas) this.cursor = null; this.refresh(); });
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();

@@ -67,15 +67,18 @@ export function groups(events, pixelsPerSecond, apart) {
   return all;
 }
 
-// A row for each label, so that none overlap and all are between 0 and `width`; −1 for a label without room. The first
-// labels have the first choice. Each has its place x and its width w.
+// A row and a place for each label, so that none overlap and all are between 0 and `width`; row −1 for a label without room. The
+// first labels have the first choice. Each has its width w, and the places that suit it, the best first.
 export function rowsOf(labels, width, rows, gap) {
   const taken = Array.from({ length: rows }, () => []);
-  return labels.map(({ x, w }) => {
-    if (x < 0 || x + w > width) return -1;
-    const row = taken.findIndex((of) => of.every(([from, to]) => x + w + gap <= from || to + gap <= x));
-    if (row >= 0) taken[row].push([x, x + w]);
-    return row;
+  return labels.map(({ places, w }) => {
+    for (const x of places.filter((it) => it >= 0 && it + w <= width)) {
+      const row = taken.findIndex((of) => of.every(([from, to]) => x + w + gap <= from || to + gap <= x));
+      if (row < 0) continue;
+      taken[row].push([x, x + w]);
+      return { row, x };
+    }
+    return { row: -1, x: 0 };
   });
 }
 

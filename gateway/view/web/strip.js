@@ -41,11 +41,12 @@ export class Strip {
     const all = groups(events, view.inside / (view.to - view.from), TOGETHER).sort((a, b) => rankOf(a.kind) - rankOf(b.kind) || a.at - b.at).slice(0, MOST_LABELS);
     const labels = all.map((group) => {
       const [text, full] = labelOf(scene, group), w = this.width(text), at = view.x(group.at);
-      return { group, text, full, w, at, x: Math.min(at, Math.max(0, view.width - w)) };
+      // To the right of its moment, or to the left.
+      return { group, text, full, w, at, places: [at, at - w] };
     });
     const rows = rowsOf(labels, view.width, ROWS, GAP), seen = new Set();
-    labels.forEach(({ group, text, full, at, x }, k) => {
-      const key = `${group.kind} ${group.at}`, row = rows[k], it = this.buttons.get(key) ?? this.button(key, group);
+    labels.forEach(({ group, text, full, at, places }, k) => {
+      const key = `${group.kind} ${group.at}`, { row, x } = rows[k], it = this.buttons.get(key) ?? this.button(key, group);
       seen.add(key);
       const said = row < 0 ? "" : text, name = `${full}, at ${clock(group.at)}`;
       if (it.textContent !== said) it.textContent = said;
@@ -53,7 +54,7 @@ export class Strip {
       // A label names itself.
       if (row < 0) it.setAttribute("aria-label", name);
       else it.removeAttribute("aria-label");
-      it.className = row < 0 ? "bare" : "";
+      it.className = row < 0 ? "bare" : x < places[0] ? "before" : "";
       it.style.transform = row < 0 ? `translate(${Math.round(at - 3)}px, ${ROW * ROWS}px)` : `translate(${Math.round(x)}px, ${ROW * row}px)`;
     });
     for (const [key, it] of this.buttons) if (!seen.has(key)) { it.remove(); this.buttons.delete(key); }

@@ -9,19 +9,28 @@ pub(super) struct HaltReasons {
     changes: Vec<(u64, Option<String>)>,
     /// The reason of the last bad cycle.
     last_bad: u8,
+    has_ticks: bool,
 }
 
 impl HaltReasons {
-    /// Adds the next tick, at a time in ns since 1970.
-    pub(super) fn add_tick(&mut self, at: u64, timing: &LoopTiming) {
+    /// Returns true if the recording contains reasons of halts.
+    pub(super) const fn are_known(&self) -> bool {
+        self.has_ticks
+    }
+
+    /// Adds the next tick, at a time in ns since 1970. Returns the reason of a halt that begins with it.
+    pub(super) fn add_tick(&mut self, at: u64, timing: &LoopTiming) -> Option<String> {
+        self.has_ticks = true;
         let was_halted = self.changes.last().is_some_and(|(_, reason)| reason.is_some());
         if timing.bad != 0 {
             self.last_bad = timing.bad;
         }
-        if was_halted != (timing.halted != 0) {
-            let reason = (timing.halted != 0).then(|| halt_text(timing.halted, self.last_bad));
-            self.changes.push((at, reason));
+        if was_halted == (timing.halted != 0) {
+            return None;
         }
+        let reason = (timing.halted != 0).then(|| halt_text(timing.halted, self.last_bad));
+        self.changes.push((at, reason.clone()));
+        reason
     }
 
     /// Returns the reason of the halt at a time, and when it began.
@@ -54,9 +63,13 @@ mod tests {
     #[test]
     fn a_halt_has_its_reason_until_the_robot_is_resumed() {
         let mut halts = HaltReasons::default();
+        assert!(!halts.are_known());
+        let mut begun = Vec::new();
         for (at, bad, halted) in [(10, 0, 0), (20, 1, 0), (30, 1, 1), (40, 0, 1), (50, 0, 0), (60, 0, 2)] {
-            halts.add_tick(at, &LoopTiming { bad, halted, ..LoopTiming::default() });
+            let timing = LoopTiming { bad, halted, ..LoopTiming::default() };
+            begun.extend(halts.add_tick(at, &timing).map(|_| at));
         }
+        assert_eq!((begun, halts.are_known()), (vec![30, 60], true));
         assert_eq!(halts.reason_at(29), None);
         let reason = "too many bad cycles in a row: the torque is not valid".to_owned();
         assert_eq!(

@@ -26,10 +26,10 @@ fn connect(server: &Server) -> TcpStream {
 
 /// Reads until the server closes the connection.
 fn rest(mut stream: TcpStream) -> String {
-    let mut answer = String::new();
-    match stream.read_to_string(&mut answer) {
+    let mut answer = Vec::new();
+    match stream.read_to_end(&mut answer) {
         Err(error) if error.kind() != ErrorKind::ConnectionReset => panic!("{error}"),
-        Ok(_) | Err(_) => answer,
+        Ok(_) | Err(_) => String::from_utf8_lossy(&answer).into_owned(),
     }
 }
 

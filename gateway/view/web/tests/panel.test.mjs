@@ -102,10 +102,11 @@ test("what is shown is asked for once, with some beside it, and again after a zo
 });
 
 test("labels of events do not overlap, and the important have the first choice", () => {
-  const labels = [[0, 50], [20, 50], [40, 50], [60, 50], [180, 50], [100, 30]].map(([x, w]) => ({ x, w })), rows = rowsOf(labels, 200, 2, 4);
-  assert.deepEqual(rows, [0, 1, -1, 0, -1, 1]);
+  const labels = [[0, 50], [20, 50], [40, 50], [60, 50], [180, 50], [100, 30]].map(([x, w]) => ({ places: [x, x - w], w })), all = rowsOf(labels, 200, 2, 4);
+  assert.deepEqual(all.map(({ row }) => row), [0, 1, -1, 0, 0, 1]);
+  assert.equal(all[4].x, 130, "on the other side of its moment");
   labels.forEach((a, i) => labels.forEach((b, k) => {
-    if (i < k && rows[i] >= 0 && rows[i] === rows[k]) assert.ok(a.x + a.w <= b.x || b.x + b.w <= a.x, `${i} ${k}`);
+    if (i < k && all[i].row >= 0 && all[i].row === all[k].row) assert.ok(all[i].x + a.w <= all[k].x || all[k].x + b.w <= all[i].x, `${i} ${k}`);
   }));
   const events = [1, 1.1, 5, 5.1].map((at_s, k) => ({ at_s, kind: k === 3 ? "halt" : "touch" }));
   assert.deepEqual(groups(events, 100, 40).map(({ kind, at, events }) => [kind, at, events.length]), [["touch", 1, 2], ["touch", 5, 1], ["halt", 5.1, 1]]);
