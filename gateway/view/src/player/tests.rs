@@ -171,7 +171,7 @@ fn curves_and_events_of_a_part_are_answered() {
     let bench = Bench::new();
     let player = bench.player();
     bench.build(&player);
-    let curves = RecordedCurves::new(player.index(), bench.skin.clone(), player.time_origin_ns());
+    let curves = RecordedCurves::new(player.index(), bench.skin, player.time_origin_ns());
     let ask = |path: &str, query: &str| curves.answer(path, query).map(|(_, bytes)| bytes);
     let events = ask("/events", "token=x&from=5&to=25.5").unwrap();
     let events: Vec<serde_json::Value> = serde_json::from_slice(&events).unwrap();
