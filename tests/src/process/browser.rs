@@ -145,15 +145,6 @@ impl Browser {
         self.call("Input.dispatchMouseEvent", &event);
     }
 
-    /// Presses the left button of the mouse for a time. `count` is 2 for the second click of a double click.
-    pub fn click_for(&mut self, [x, y]: [f64; 2], count: u8, time: Duration) {
-        for (kind, buttons) in [("mousePressed", 1), ("mouseReleased", 0)] {
-            let event = json!({ "type": kind, "x": x, "y": y, "button": "left", "buttons": buttons, "clickCount": count });
-            self.call("Input.dispatchMouseEvent", &event);
-            std::thread::sleep(time);
-        }
-    }
-
     pub fn key(&mut self, kind: &str, key: &str) {
         self.call("Input.dispatchKeyEvent", &json!({ "type": kind, "key": key }));
     }

@@ -267,62 +267,6 @@ fn a_click_on_why_of_a_moving_list_explains_and_a_halt_says_what_to_press() {
     place.is_left_clean();
 }
 
-/// Clicks of a hand, of 90 ms, single and double, on buttons while everything around them changes.
-#[test]
-#[ignore = "needs tests/tools/install"]
-fn each_click_does_what_its_button_says() {
-    let place = TestDir::new();
-    let (run, address) = watched(&place, 12, "");
-    let mut browser = Browser::new(1400, 900);
-    browser.open(&address.url());
-    browser.until("window.skinbus && window.skinbus.frames > 3");
-    browser.value(
-        "(() => { const it = document.getElementById('search'); it.value = 'vcan0:5'; it.onchange(); })()",
-    );
-    let of_text = |text: &str| {
-        format!(
-            "[...document.querySelectorAll('#side button')].find((it) => it.textContent === '{text}' && !it.disabled)"
-        )
-    };
-    let click = |browser: &mut Browser, text: &str, clicks: u8| {
-        let button = of_text(text);
-        browser.until(&format!("{button}?.scrollIntoView({{ block: 'nearest' }}) === undefined && {button}"));
-        let at = browser.value(&format!(
-            "(() => {{ const b = {button}.getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; }})()"
-        ));
-        let at = [0, 1].map(|axis| at[axis].as_f64().unwrap());
-        browser.mouse("mouseMoved", at);
-        for count in 1..=clicks {
-            browser.click_for(at, count, std::time::Duration::from_millis(90));
-        }
-    };
-    for (first, last) in [("Kill", "Restart"), ("Take down", "Bring up"), ("Hold", "Hold")] {
-        for clicks in [1, 2, 1, 2] {
-            click(&mut browser, first, clicks);
-            browser.until(&match first {
-                "Hold" => {
-                    "document.getElementById('hold').getAttribute('aria-pressed') === 'true'".to_owned()
-                }
-                _ => of_text(last),
-            });
-            // The second click of a double click has changed nothing back.
-            std::thread::sleep(std::time::Duration::from_millis(600));
-            click(&mut browser, last, clicks);
-            browser.until(&match first {
-                "Hold" => {
-                    "document.getElementById('hold').getAttribute('aria-pressed') === 'false'".to_owned()
-                }
-                _ => of_text(first),
-            });
-            std::thread::sleep(std::time::Duration::from_millis(600));
-        }
-    }
-    drop(browser);
-    run.signal(rustix::process::Signal::INT);
-    run.end();
-    place.is_left_clean();
-}
-
 #[test]
 #[ignore = "needs tests/tools/install"]
 fn a_recording_is_gone_through_in_a_browser() {
