@@ -77,10 +77,7 @@ impl PlayedTopics {
         }
         self.jumps = jumps;
         let until = if is_end { u64::MAX } else { at };
-        loop {
-            let Some(RecordedMessage { channel, log_nanos, message }) = self.reader.next_until(until)? else {
-                break;
-            };
+        while let Some(RecordedMessage { channel, log_nanos, message }) = self.reader.next_until(until)? {
             if let Some(known) = self.channels.get(channel) {
                 self.hub.publish(*known, log_nanos, message);
             } else {
