@@ -26,7 +26,7 @@ import * as words from "./words.js";
 const $ = (id) => document.getElementById(id);
 const canvas = $("picture"), camera = new Camera(), health = new Health();
 // What the picture shows of the scene: its outline, its links, its joints' axes; the pose, and the one to expect.
-let parts = [], links = [], turning = [], pose = new Float64Array(), soon = pose, poses = [], drawnAt = 0, jumps = true, most = 1, shownArrows = null;
+let parts = [], links = [], turning = [], pose = new Float64Array(), soon = pose, poses = [], drawnAt = 0, jumps = true, most = 1, shownArrows = null, shownAxes = "";
 let picture = null, scene = null, plots = null, snapshot = null, said = null, all = null, trees = [], chosen = -1, pressed = -1, awaited = -1, isPressing = false;
 // For browser tests.
 window.skinbus = { frames: 0, snapshots: 0, where, camera, filled: () => filled(), joints: () => snapshot?.joints.map((joint) => joint.position) ?? [] };
@@ -42,7 +42,7 @@ try {
   message(`The picture cannot be drawn: ${error.message}. The tables still work.`);
 }
 
-const view = () => camera.matrix(canvas.clientWidth, canvas.clientHeight);
+const size = () => picture?.size ?? [canvas.clientWidth, canvas.clientHeight], view = () => camera.matrix(...size());
 
 const painter = new Painter(picture?.software ?? false, draw);
 $("software").hidden = !picture?.software;
@@ -73,11 +73,11 @@ function draw(ratio) {
 
 // Moves the camera to where the robot is now.
 function follow() {
-  const now = performance.now(), seconds = Math.min(0.5, (now - drawnAt) / 1000);
+  const now = performance.now(), seconds = Math.min(2, (now - drawnAt) / 1000);
   drawnAt = now;
   // Without new snapshots the robot stands still.
-  const stands = !poses[1] || now - poses[1].at > 200;
-  camera.follow(pose, stands ? pose : soon, seconds, now, canvas.clientWidth, canvas.clientHeight, jumps);
+  const stands = poses.length < 2 || now - poses[poses.length - 1].at > 400;
+  camera.follow(pose, stands ? pose : soon, seconds, now, ...size(), jumps);
   if (jumps) picture?.lay(camera.size, floor());
   jumps = false;
 }
@@ -85,12 +85,14 @@ function follow() {
 // The height of the ground: that of the base, or of anything that is below it at first.
 const floor = () => Math.min(0, pose.reduce((low, v, i) => (i % 3 === 2 ? Math.min(low, v) : low), Infinity));
 
-// Keeps a new pose, and estimates the next one from how fast the joints move.
-function placeRobot(joints) {
-  const now = performance.now(), before = poses[1], passed = before ? (now - before.at) / 1000 : 0;
-  poses = [before, { at: now, joints }];
+// Keeps a new pose, and estimates the next one from how fast the joints move. Snapshots may arrive in bursts: their own
+// times say how fast.
+function placeRobot(joints, time) {
+  poses.push({ at: performance.now(), time, joints });
+  while (poses.length > 2 && time - poses[1].time > 0.06) poses.shift();
+  const [before] = poses, passed = time - before.time;
   pose = placed(parts, all);
-  soon = passed > 0.005 && passed < 0.5 ? placed(parts, frames(scene, joints.map((q, j) => q + (q - before.joints[j]) / passed * AHEAD_S))) : pose;
+  soon = passed > 0.005 && passed < 1 ? placed(parts, frames(scene, joints.map((q, j) => q + (q - before.joints[j]) / passed * AHEAD_S))) : pose;
 }
 
 // Draws the arrows of a new snapshot.
@@ -106,7 +108,9 @@ function point3d() {
 
 // Draws the axes of the robot's base in the corner.
 function triad() {
-  const at = axesSeen(camera.basis());
+  const at = axesSeen(camera.basis()), state = JSON.stringify(at.map(({ x, y, deep }) => [x, y, deep < 0]));
+  if (state === shownAxes) return;
+  shownAxes = state;
   for (const { name, x, y, deep } of at) {
     const line = $(`axis-${name}`), text = $(`name-${name}`);
     for (const [key, value] of [["x2", x * 22], ["y2", y * 22], ["opacity", deep < 0 ? 0.6 : 1]]) line.setAttribute(key, String(value));
@@ -230,7 +234,7 @@ const link = new Link({
     snapshot = it;
     const joints = it.joints.map((joint) => joint.position), first = !all;
     all = frames(scene, joints);
-    placeRobot(joints);
+    placeRobot(joints, it.time);
     if (first || jumps && camera.auto && camera.steers) direct(it.cells);
     plots.push(it);
     answerPress();
@@ -300,7 +304,7 @@ $("hold-frames").onclick = () => hold($("hold-frames").getAttribute("aria-presse
 $("halt").onclick = () => link.send({ do: "halt" });
 $("resume").onclick = () => link.send({ do: "resume" });
 window.addEventListener("blur", release);
-window.addEventListener("resize", () => { plots?.refresh(); redraw(); });
+for (const event of ["resize", "sized"]) window.addEventListener(event, () => { plots?.refresh(); redraw(); });
 // Nothing moves under the pointer while a button is down: what has come is shown after that.
 window.addEventListener("pointerdown", ({ target }) => { isPressing = target.closest?.("button") !== null; });
 for (const end of ["pointerup", "pointercancel", "blur"]) window.addEventListener(end, () => { isPressing = false; redraw(); });

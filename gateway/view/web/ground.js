@@ -1,7 +1,7 @@
 // The ground: a grid below the robot, which fades away, and the x and y axes of its base.
 
-// So many lines to each side of the middle.
-const LINES = 14;
+// The lines to each side of the middle, and the pieces of half a line.
+const LINES = 14, PIECES = 3;
 const X = [0.85, 0.27, 0.3], Y = [0.25, 0.62, 0.3];
 
 // The distance between lines for a robot of this size, in m.
@@ -11,21 +11,24 @@ export const spacing = (size) => [0.02, 0.05, 0.1, 0.2, 0.5, 1, 2].find((it) => 
 export function ground(size, height, back, line) {
   const step = spacing(size), far = LINES * step, out = [];
   const colour = (p, of) => { const t = Math.min(1, Math.hypot(p[0], p[1]) / far) ** 1.4; return of.map((v, i) => v + (back[i] - v) * t); };
-  for (let k = -LINES; k <= LINES; k++) {
-    for (let i = -LINES; i < LINES; i++) {
-      for (const turned of [false, true]) {
-        const place = (at) => (turned ? [k * step, at * step, height] : [at * step, k * step, height]);
-        const of = k ? (k % 5 ? line : line.map((v, j) => v + (v - back[j]) * 0.5)) : turned ? Y : X;
-        const ends = [place(i), place(i + 1)];
-        if (Math.min(...ends.map((p) => Math.hypot(p[0], p[1]))) >= far) continue;
-        for (const p of ends) out.push(...p, ...colour(p, of));
+  for (let k = 1 - LINES; k < LINES; k++) {
+    // A line ends where it has faded away, and is few pieces: a software renderer takes time for each.
+    const half = Math.sqrt(LINES * LINES - k * k + 0.001) * step / PIECES;
+    for (const turned of [false, true]) {
+      const place = (at) => (turned ? [k * step, at * half, height] : [at * half, k * step, height]);
+      const of = k ? (k % 5 ? line : line.map((v, j) => v + (v - back[j]) * 0.5)) : turned ? Y : X;
+      for (let i = -PIECES; i < PIECES; i++) {
+        for (const p of [place(i), place(i + 1)]) out.push(...p, ...colour(p, of));
       }
     }
   }
   return new Float32Array(out);
 }
 
-// The axes of the base on the screen, for a small drawing: each as its end from the middle, nearest last.
+const coarse = (v) => Math.round(v * 25) / 25;
+
+// The axes of the base on the screen, for a small drawing: each as its end from the middle, nearest last. Steps are so
+// coarse that the drawing seldom changes.
 export function axes([right, up, to]) {
-  return ["x", "y", "z"].map((name, k) => ({ name, x: right[k], y: -up[k], deep: to[k] })).sort((a, b) => a.deep - b.deep);
+  return ["x", "y", "z"].map((name, k) => ({ name, x: coarse(right[k]), y: coarse(-up[k]), deep: to[k] })).sort((a, b) => a.deep - b.deep);
 }

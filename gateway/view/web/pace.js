@@ -4,10 +4,13 @@
 export const SOFTWARE_HZ = 15;
 // The picture is drawn in full resolution after it has stood still for this time.
 export const STILL_MS = 400;
+// While frames take longer than the first time in ms, a moving picture in software has fewer pixels; more again, if they
+// take less than the second.
+const LATE_MS = 40, EARLY_MS = 16, RATIOS = [1, 0.85, 0.7];
 
 export class Pace {
   constructor(software) {
-    Object.assign(this, { software, began: -Infinity, ended: -Infinity, cost: 0 });
+    Object.assign(this, { software, began: -Infinity, ended: -Infinity, cost: 0, mean: 25, level: 0 });
   }
 
   // The time until the next frame may begin: a pause as long as the last frame took.
@@ -23,11 +26,15 @@ export class Pace {
   // The browser is ready for the next frame.
   ready(now) {
     this.cost = Math.min(500, now - this.ended);
+    this.mean += (this.cost - this.mean) / 4;
+    const level = this.level + (this.mean > LATE_MS ? 1 : this.mean < EARLY_MS ? -1 : 0);
+    if (level === this.level || !RATIOS[level]) return;
+    [this.level, this.mean] = [level, (LATE_MS + EARLY_MS) / 2];
   }
 
   // Pixels of the picture per pixel of the page, along each side.
   ratio(device, still) {
-    return this.software ? (still ? 2 : 1) : Math.min(2, device);
+    return this.software ? (still ? 2 : RATIOS[this.level]) : Math.min(2, device);
   }
 }
 

@@ -105,7 +105,12 @@ const LEGIBLE = 12;
 export class Picture {
   // With `numbers`, hexagons that are large enough show their cells' node ids.
   constructor(canvas, numbers = false) {
-    Object.assign(this, { canvas, numbers }, context(canvas));
+    Object.assign(this, { canvas, numbers, size: [canvas.clientWidth, canvas.clientHeight] }, context(canvas));
+    // Reading the size in each frame would have the page laid out in each.
+    new ResizeObserver(() => {
+      this.size = [canvas.clientWidth, canvas.clientHeight];
+      window.dispatchEvent(new Event("sized"));
+    }).observe(canvas);
   }
 
   // Sets the scene, which does not change.
@@ -132,7 +137,7 @@ export class Picture {
     order.forEach((i, at) => {
       const cell = scene.cells[i], chain = scene.buses[cell.bus].chain, last = this.groups[this.groups.length - 1];
       if (last && last.chain === chain && last.row === cell.row) last.count++;
-      else this.groups.push({ chain, row: cell.row, first: at, count: 1 });
+      else this.groups.push({ chain, row: cell.row, first: at, count: 1, around: scene.tubes.some((tube) => tube.chain === chain && tube.row === cell.row) });
     });
     const nearest = neighbors(scene), { corners, fan } = this.software ? TRIANGLE : HEXAGON;
     [this.vertices, this.indices] = [corners.length, fan.length];
@@ -251,17 +256,17 @@ export class Picture {
   // Draws if anything has changed since the last time, or if a finer picture is due. Returns true if it drew.
   draw(view, frames, ratio) {
     const { gl, canvas, theme, solid, cell } = this;
-    const seen = [canvas.clientWidth, canvas.clientHeight, ...view, ...frames.flat(2)];
+    const [width, height] = this.size, seen = [width, height, ...view, ...frames.flat(2)];
     const same = !this.changed && this.seen?.length === seen.length && seen.every((v, i) => v === this.seen[i]);
     if (same && ratio <= this.ratio) return false;
     Object.assign(this, { seen, ratio, changed: false });
-    const [w, h] = [Math.round(canvas.clientWidth * ratio), Math.round(canvas.clientHeight * ratio)];
+    const [w, h] = [Math.round(width * ratio), Math.round(height * ratio)];
     if (canvas.width !== w || canvas.height !== h) { canvas.width = w; canvas.height = h; }
     gl.viewport(0, 0, w, h);
     gl.enable(gl.DEPTH_TEST);
     gl.clearColor(...theme.back, 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    // Cells first, so that anything below them is not drawn.
+    // Cells first, so that anything below them is not drawn. The backs of cells around a link are not seen.
     gl.useProgram(cell.program);
     gl.bindVertexArray(this.cells);
     gl.uniformMatrix4fv(cell.view, false, view);
@@ -269,10 +274,12 @@ export class Picture {
     gl.uniform3fv(cell.edge, theme.edge);
     gl.uniform3fv(cell.chosen, theme.chosen);
     if (this.numbers) gl.uniform1f(cell.legible, LEGIBLE * ratio);
-    for (const { chain, row, first, count } of this.groups) {
+    for (const { chain, row, first, count, around } of this.groups) {
+      gl[around ? "enable" : "disable"](gl.CULL_FACE);
       gl.uniformMatrix4fv(cell.m, false, frames[chain][row]);
       gl.drawElements(gl.TRIANGLES, count * this.indices, gl.UNSIGNED_INT, first * this.indices * 4);
     }
+    gl.disable(gl.CULL_FACE);
     if (this.wires.length) {
       const { wire, ribbon } = this, corners = ribbons(this.scene, frames, this.wires);
       gl.useProgram(wire.program);

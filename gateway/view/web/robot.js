@@ -68,7 +68,7 @@ export function axes(scene, nearest, i) {
   return [x, cross(normal, x)];
 }
 
-const SIDES = 20;
+const SIDES = 16;
 
 // Triangles of a cylinder with closed ends: positions and normals.
 export function triangles({ from, to, radius }) {
