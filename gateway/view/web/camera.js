@@ -11,7 +11,9 @@ const FILL = 0.84, TIGHT = 0.81, ROOMY = 0.88, MOST = 0.985;
 const RATE = Math.log(1.19), STIFF = 7;
 // If the robot becomes larger or smaller faster than the zoom may follow, beyond these shares, the view turns by itself:
 // how fast in rad/s, how far up and down, and the angle that it tries.
-const EASY = [0.78, 0.9], STEER_RATE = 1.2, STEERED = [0.25, 1.2], TRIED = 0.03;
+const EASY = [0.78, 0.9], STEER_RATE = 1.2, STEERED = [0.15, 1.35], TRIED = 0.03;
+// Beyond these it turns as far as it takes, in four steps of at most this speed in rad/s.
+const HELD = [0.74, 0.95], RESCUE_RATE = 1.5;
 // A view that a user turns follows faster.
 const TURNED_RATE = Math.log(4), TURNED_MS = 500;
 // The times in s in which the view follows a robot that moves aside, and reaches another direction.
@@ -19,9 +21,13 @@ const FOLLOWED_S = 0.5, TURN_S = 0.45;
 const STEEPEST = 1.5;
 // The time in s for which a motion is expected to go on as it is.
 export const AHEAD_S = 0.4;
+// The longest step in s in which the view follows a motion.
+const STEP_S = 1 / 30;
 
 // In a picture that is higher than wide, the width limits the view.
 const focus = (width, height) => FOCUS * Math.min(1, width / Math.max(1, height));
+// The points a share of the way from some to others.
+const between = (from, to, share) => (share === 0 || from === to ? from : share === 1 ? to : to.map((v, i) => from[i] + (v - from[i]) * share));
 const clamp = (v, low, high) => Math.min(high, Math.max(low, v));
 
 export class Camera {
@@ -41,18 +47,20 @@ export class Camera {
   // The bounds of points, three numbers each, as the picture sees them: for each side of the picture the largest offset
   // plus the depth times the slope of that side. They do not depend on the place of the eye.
   bounds(points, width, height, share, basis = this.basis()) {
-    const [right, up, to] = basis, f = focus(width, height);
-    const slopes = [share * width / Math.max(1, height) / f, share / f], most = [-Infinity, -Infinity, -Infinity, -Infinity];
-    let [low, high] = [Infinity, -Infinity];
+    const [[ax, ay, az], [bx, by, bz], [cx, cy, cz]] = basis, f = focus(width, height);
+    const slopes = [share * width / Math.max(1, height) / f, share / f], [sx, sy] = slopes;
+    let [right, left, top, bottom, low, high] = [-Infinity, -Infinity, -Infinity, -Infinity, Infinity, -Infinity];
     for (let i = 0; i < points.length; i += 3) {
-      const p = [points[i], points[i + 1], points[i + 2]], z = dot(p, to);
-      [right, up].forEach((axis, k) => {
-        const v = dot(p, axis), deep = slopes[k] * z;
-        most[2 * k] = Math.max(most[2 * k], v + deep);
-        most[2 * k + 1] = Math.max(most[2 * k + 1], deep - v);
-      });
-      [low, high] = [Math.min(low, z), Math.max(high, z)];
+      const x = points[i], y = points[i + 1], z = points[i + 2];
+      const across = ax * x + ay * y + az * z, along = bx * x + by * y + bz * z, deep = cx * x + cy * y + cz * z;
+      right = Math.max(right, across + sx * deep);
+      left = Math.max(left, sx * deep - across);
+      top = Math.max(top, along + sy * deep);
+      bottom = Math.max(bottom, sy * deep - along);
+      low = Math.min(low, deep);
+      high = Math.max(high, deep);
     }
+    const most = [right, left, top, bottom];
     return { slopes, most, depth: (low + high) / 2 };
   }
 
@@ -65,12 +73,23 @@ export class Camera {
   }
 
   // Follows the robot, whose outline is these points, after a time in s. `soon` are those that it is expected to have
-  // next; `now` is in ms.
+  // next; `now` is in ms. However late a frame is, the way to it is followed in short steps.
   follow(points, soon, seconds, now, width, height, jumps = false) {
     if (!points.length || !width || !height) return;
+    const from = jumps || this.last?.length !== points.length ? points : this.last;
+    this.last = points;
+    const steps = Math.max(1, Math.ceil(seconds / STEP_S - 1e-6)), step = seconds / steps;
+    for (let k = 1; k <= steps; k++) {
+      const at = k === steps ? points : between(from, points, k / steps), ahead = AHEAD_S - (steps - k) * step;
+      this.go(at, ahead > 0 ? between(points, soon, ahead / AHEAD_S) : between(from, points, Math.min(1, (k * step + AHEAD_S) / seconds)), step, now, width, height, jumps);
+    }
+  }
+
+  go(points, soon, seconds, now, width, height, jumps) {
     if (this.goal) this.approach(seconds);
     if (!this.auto) return;
     if (this.steers && !this.fresh && !jumps) this.steer(points, seconds, width, height);
+    if (this.steers && !this.fresh && !jumps) this.rescue(points, seconds, width, height);
     const basis = this.basis(), wanted = this.fitted(points, width, height, FILL, basis);
     if (this.fresh || jumps) {
       Object.assign(this, wanted, { fresh: false, speed: 0, steering: [0, 0], size: wanted.distance / FOCUS });
@@ -102,6 +121,24 @@ export class Camera {
     });
     this.yaw += this.steering[0] * seconds;
     this.pitch = clamp(this.pitch + this.steering[1] * seconds, ...STEERED);
+  }
+
+  // Turns at once, by as little as helps, if the robot would not fit even with the fastest zoom.
+  rescue(points, seconds, width, height) {
+    const off = (yaw, pitch) => {
+      const fill = this.fitted(points, width, height, 1, this.basis(yaw, pitch)).distance / this.distance;
+      return Math.max(0, Math.log(HELD[0] / fill), Math.log(fill / HELD[1]));
+    };
+    let least = off(this.yaw, this.pitch);
+    for (let ring = 1; least > 0 && ring <= 4; ring++) {
+      const far = RESCUE_RATE * seconds * ring / 4;
+      let best = [this.yaw, this.pitch];
+      for (let k = 0; k < 12; k++) {
+        const yaw = this.yaw + Math.cos(k * Math.PI / 6) * far, pitch = clamp(this.pitch + Math.sin(k * Math.PI / 6) * far, ...STEERED), it = off(yaw, pitch);
+        if (it < least) [best, least] = [[yaw, pitch], it];
+      }
+      [this.yaw, this.pitch] = best;
+    }
   }
 
   // Moves aside so far that no point is outside the picture.
