@@ -1,36 +1,38 @@
-//! The colours of values: cividis (Nuñez, Anderton and Renslow, *Optimizing colormaps with consideration for color
-//! vision deficiency*, 2018), whose order all readers can see, with any kind of colour vision. High values contrast
-//! with the background: dark on paper, light on a dark screen.
+//! The colours of values: viridis (Smith and van der Walt, *A better default colormap for Matplotlib*, 2015), whose
+//! order all readers can see, with any kind of colour vision. High values contrast with the background: dark on paper,
+//! light on a dark screen. The pages of `skinbus view` have the same colours (`gateway/view/web/colours.js`).
 
 use std::fmt::Write as _;
 
 /// Number of colours for values above 0.
 pub(super) const COLOUR_LEVEL_COUNT: usize = 16;
 
-/// The colours of cividis at equal distances, as red, green and blue.
-const CIVIDIS_RGB: [[f64; 3]; 10] = [
-    [0.0, 34.0, 78.0],
-    [18.0, 53.0, 112.0],
-    [59.0, 73.0, 108.0],
-    [87.0, 93.0, 109.0],
-    [112.0, 113.0, 115.0],
-    [138.0, 134.0, 120.0],
-    [165.0, 156.0, 116.0],
-    [195.0, 179.0, 105.0],
-    [225.0, 204.0, 85.0],
-    [254.0, 232.0, 56.0],
+/// The colours of viridis at equal distances, as red, green and blue.
+const VIRIDIS_RGB: [[f64; 3]; 10] = [
+    [68.0, 1.0, 84.0],
+    [72.0, 40.0, 120.0],
+    [62.0, 74.0, 137.0],
+    [49.0, 104.0, 142.0],
+    [38.0, 130.0, 142.0],
+    [31.0, 158.0, 137.0],
+    [53.0, 183.0, 121.0],
+    [110.0, 206.0, 88.0],
+    [181.0, 222.0, 43.0],
+    [253.0, 231.0, 37.0],
 ];
+/// The parts of viridis for the lowest and the highest value, on paper and on a dark screen.
+const SCALES: [[f64; 2]; 2] = [[0.9, 0.0], [0.4, 1.0]];
 
 /// The background of cells and rows, on paper and on a dark screen.
 pub(super) const BACKGROUND_COLOURS: [&str; 2] = ["#EBEDEF", "#26292E"];
 
-/// Returns the cividis colour at a position from 0 to 1, as a CSS colour.
+/// Returns the viridis colour at a position from 0 to 1, as a CSS colour.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 9, and 0 to 255")]
-fn cividis_css_colour(place: f64) -> String {
-    let at = place.clamp(0.0, 1.0) * (CIVIDIS_RGB.len() - 1) as f64;
+fn viridis_css_colour(place: f64) -> String {
+    let at = place.clamp(0.0, 1.0) * (VIRIDIS_RGB.len() - 1) as f64;
     let (from, part) = (at.floor() as usize, at.fract());
     let [one, next] =
-        [from, from + 1].map(|at| CIVIDIS_RGB.get(at).or(CIVIDIS_RGB.last()).copied().unwrap_or_default());
+        [from, from + 1].map(|at| VIRIDIS_RGB.get(at).or(VIRIDIS_RGB.last()).copied().unwrap_or_default());
     let mut text = "#".to_owned();
     for (one, next) in one.into_iter().zip(next) {
         let _ = write!(text, "{:02X}", (one + part * (next - one)).round() as u8);
@@ -41,7 +43,7 @@ fn cividis_css_colour(place: f64) -> String {
 /// Returns the colours of a level on paper and on a dark screen; levels count from 0.
 pub(super) fn level_colours(level: usize) -> [String; 2] {
     let part = level as f64 / (COLOUR_LEVEL_COUNT - 1) as f64;
-    [cividis_css_colour(1.0 - part), cividis_css_colour(0.2 + 0.8 * part)]
+    SCALES.map(|[low, high]| viridis_css_colour(low + (high - low) * part))
 }
 
 /// Returns the level of colour, from 0, for a value above 0 and up to `max`.
@@ -75,10 +77,19 @@ mod tests {
     #[test]
     fn levels_grow_darker_on_paper_and_lighter_on_a_dark_screen() {
         let all: Vec<_> = (0..COLOUR_LEVEL_COUNT).map(level_colours).collect();
-        assert_eq!(all[0][0], "#FEE838");
-        assert_eq!(all[COLOUR_LEVEL_COUNT - 1], ["#00224E", "#FEE838"]);
+        assert_eq!(all[0], ["#BCDF2A", "#2A788E"]);
+        assert_eq!(all[COLOUR_LEVEL_COUNT - 1], ["#440154", "#FDE725"]);
         assert!(all.is_sorted_by(|one, next| luminance(&one[0]) > luminance(&next[0])));
         assert!(all.is_sorted_by(|one, next| luminance(&one[1]) < luminance(&next[1])));
+    }
+
+    #[test]
+    fn the_pages_have_the_same_colours() {
+        let page = include_str!("../../../../view/web/colours.js");
+        let stops = VIRIDIS_RGB.map(|[r, g, b]| format!("[{r}, {g}, {b}]")).join(", ");
+        assert!(page.contains(&format!("const STOPS = [{stops}];")), "{stops}");
+        let [paper, dark] = SCALES.map(|[low, high]| format!("[{low}, {high}]"));
+        assert!(page.contains(&format!("const [ON_DARK, ON_LIGHT] = [{dark}, {paper}];")), "{dark}, {paper}");
     }
 
     #[test]
