@@ -42,12 +42,14 @@ export class Pace {
 // did other work that takes time.
 export class Painter {
   constructor(software, draw) {
-    Object.assign(this, { pace: new Pace(software), draw, due: false, later: 0 });
+    Object.assign(this, { pace: new Pace(software), draw, due: false, later: 0, sharp: true, stood: 0 });
   }
 
   redraw() {
     if (this.due) return;
     this.due = true;
+    // A picture that is about to change is not worth four times the pixels.
+    clearTimeout(this.later);
     setTimeout(() => requestAnimationFrame(() => this.paint(false)), this.pace.wait(performance.now()));
   }
 
@@ -55,11 +57,14 @@ export class Painter {
     this.due = false;
     const { pace } = this, began = performance.now();
     const { drew, worked } = this.draw(pace.ratio(window.devicePixelRatio || 1, still));
-    if (!drew && !worked) return;
-    pace.drew(began, performance.now());
-    requestAnimationFrame(() => pace.ready(performance.now()));
-    if (!drew || still || !pace.software) return;
+    if (drew) this.sharp = still;
+    if (drew || worked) {
+      if (drew) this.stood = performance.now();
+      pace.drew(began, performance.now());
+      requestAnimationFrame(() => pace.ready(performance.now()));
+    }
     clearTimeout(this.later);
-    this.later = setTimeout(() => requestAnimationFrame(() => this.paint(true)), STILL_MS);
+    if (this.sharp || !pace.software) return;
+    this.later = setTimeout(() => requestAnimationFrame(() => { if (!this.due) this.paint(true); }), Math.max(0, this.stood + STILL_MS - performance.now()));
   }
 }

@@ -10,7 +10,7 @@ import { axes as axesSeen, ground, spacing } from "../ground.js";
 import { haltedWords } from "../halted.js";
 import { Health } from "../health.js";
 import { cross, direction, dot, look, perspective, point, project, row, times, unit } from "../math.js";
-import { Pace, SOFTWARE_HZ } from "../pace.js";
+import { Pace, Painter, SOFTWARE_HZ, STILL_MS } from "../pace.js";
 import { axes, cylinders, facing, frames, neighbors, outline, placed, triangles } from "../robot.js";
 import { cellOf, decode, decodeHistory } from "../snapshot.js";
 import { pick } from "../touch.js";
@@ -349,6 +349,31 @@ test("a frame is followed by as long a pause as it took, and software has a limi
   const frame = (took) => { soft.drew(0, 0); soft.ready(took); return soft.ratio(1, false); };
   const many = (took) => Array.from({ length: 40 }, () => frame(took))[39];
   assert.deepEqual([many(30), many(90), soft.ratio(1, true), many(30), many(5)], [1, 0.7, 2, 0.7, 1]);
+});
+
+test("a picture that is about to change is not drawn in full resolution, one that stands still is", (t) => {
+  t.mock.timers.enable({ apis: ["setTimeout"] });
+  const drawn = [], keep = [globalThis.requestAnimationFrame, globalThis.window];
+  [globalThis.requestAnimationFrame, globalThis.window] = [(then) => { then(0); }, { devicePixelRatio: 1 }];
+  let changed = true;
+  const painter = new Painter(true, (ratio) => { const drew = changed || ratio === 2; if (drew) drawn.push(ratio); changed = false; return { drew, worked: true }; });
+  painter.redraw();
+  t.mock.timers.tick(1000 / SOFTWARE_HZ);
+  assert.equal(drawn.length, 1);
+  // The next frame is due, however late.
+  t.mock.timers.tick(STILL_MS - 100);
+  painter.pace.wait = () => 5000;
+  changed = true;
+  painter.redraw();
+  t.mock.timers.tick(4000);
+  assert.deepEqual(drawn, [1]);
+  t.mock.timers.tick(1000);
+  assert.deepEqual(drawn, [1, 1]);
+  painter.pace.wait = () => 0;
+  painter.redraw();
+  for (let k = 0; k < 3; k++) t.mock.timers.tick(STILL_MS);
+  assert.deepEqual(drawn, [1, 1, 2], "news without a change do not keep it coarse");
+  [globalThis.requestAnimationFrame, globalThis.window] = keep;
 });
 
 test("a process offers what makes sense, and says which cells it runs", () => {
