@@ -7,7 +7,7 @@ use super::facts::format_micros;
 use super::{PageDraft, without_empty_series};
 use crate::paper;
 use crate::report::figure::{
-    Axis, Figure, LowerDiagram, MarkLine, Section, SeriesShape, Table, format_quantity,
+    Axis, Figure, LowerDiagram, MarkLine, Section, Series, SeriesShape, Table, format_quantity,
 };
 use crate::report::thin::ThinnedLine;
 use model::table::{TorqueAccuracy, TorqueErrors};
@@ -54,7 +54,7 @@ impl PageDraft<'_> {
         let mut section = Section::new("torque", "Torque, and its difference from the central computation");
         if !loaded.is_empty() {
             let when = if self.run.frames_only.is_some() { "before each broadcast" } else { "at each tick" };
-            section = section.with_paragraph(format!("The upper curve is the sum of the torques received {when}. The lower curve is the \
+            section = section.with_paragraph(format!("The upper curves are the sum of the torques received {when}, and the central computation. The lower curve is the \
              difference, once per epoch, between the sum of all cells' answers and the central computation for the same positions; an epoch without an \
              answer in time is a gap. Dotted lines: one step of the torque words."));
             let is_compared = self.run.bus_figures.iter().any(|it| it.lines.error.point_count() > 0);
@@ -125,7 +125,15 @@ impl PageDraft<'_> {
         let kind = self.run.skin.robot.joints.get(joint).map_or(JointKind::Revolute, |joint| joint.kind);
         let quantity = if kind == JointKind::Prismatic { "force" } else { "torque" };
         let unit = kind.torque_unit();
-        let distributed = self.run.motion.distributed.get(joint).map(|line| self.thinned_series("", line));
+        let motion = &self.run.motion;
+        let distributed =
+            motion.distributed.get(joint).map(|line| self.thinned_series("sum of the cells' torques", line));
+        let central =
+            motion.central.get(joint).filter(|line| line.points().iter().any(|it| it.1.is_finite()));
+        let central = central.map(|line| Series {
+            shape: SeriesShape::Dashed,
+            ..self.thinned_series("central computation", line)
+        });
         let of_bus = |(_, place, bus_figures): (usize, usize, &BusFigures)| {
             let line = bus_figures.lines.difference.get(place)?;
             (line.point_count() > 0).then(|| self.thinned_series(self.bus_caption(bus_figures), line))
@@ -134,7 +142,8 @@ impl PageDraft<'_> {
         let figure = self
             .time_figure(format!("torque-joint{}", joint + 1), title, Axis::new(quantity, unit))
             .with_half_width()
-            .with_series(distributed);
+            .with_series(distributed)
+            .with_series(central);
         if series.is_empty() {
             return figure;
         }
