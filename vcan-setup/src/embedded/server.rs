@@ -41,6 +41,7 @@ const MAX_FAILURES: u32 = 1_000;
 const LISTENER: u64 = u64::MAX;
 const STOP: u64 = u64::MAX - 1;
 const REPORT: u64 = u64::MAX - 2;
+const ROUND_END: u64 = u64::MAX - 3;
 
 /// The reason why a bus cannot be served any longer.
 #[derive(Debug, Error)]
@@ -88,6 +89,8 @@ pub struct Server {
 struct TimedRounds {
     bus: TimedBus,
     clock: BusClock,
+    /// A timer for the end of a round: a timeout of `epoll` counts in ms.
+    timer: Option<OwnedFd>,
     /// The difference by which times of the wall clock are to be increased in this round, in ns.
     wall_offset: i64,
     effects: RoundEffects,
@@ -198,11 +201,12 @@ impl Server {
             epoll::add(&self.post.epoll, requests, EventData::new_u64(REPORT), EventFlags::IN)
                 .map_err(|errno| failed("watch for requests of reports", errno))?;
         }
+        self.create_round_timer().map_err(|errno| failed("create the timer of the bus", errno))?;
         let mut events = Vec::with_capacity(256);
         loop {
             events.clear();
             let pause = self.resume_at.map(|at| at.saturating_duration_since(Instant::now()));
-            let pause = pause.into_iter().chain(self.time_to_round_end()).min();
+            self.set_round_timer().map_err(|errno| failed("set the timer of the bus", errno))?;
             let timeout = pause.and_then(|pause| Timespec::try_from(pause).ok());
             match epoll::wait(&self.post.epoll, spare_capacity(&mut events), timeout.as_ref()) {
                 Ok(_) | Err(Errno::INTR) => {}
@@ -215,6 +219,7 @@ impl Server {
                     STOP => return Ok(self.end()),
                     REPORT => self.answer_report_requests(&mut reports),
                     LISTENER => self.accept_clients(),
+                    ROUND_END => {}
                     token => {
                         if let Ok(index) = usize::try_from(token) {
                             self.serve(ClientId(index), flags, &mut batch);

@@ -5,9 +5,14 @@ use std::os::fd::OwnedFd;
 use std::time::Duration;
 
 use protocol::bus::batch::Datagram;
+use rustix::event::epoll::{self, EventData, EventFlags};
+use rustix::io::Errno;
 use rustix::net::RecvFlags;
+use rustix::time::{
+    Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, Timespec, timerfd_create, timerfd_settime,
+};
 
-use super::{ReportSink, Server, TimedRounds};
+use super::{ROUND_END, ReportSink, Server, TimedRounds};
 use crate::embedded::parcel::FrameDatagram;
 use crate::embedded::routing::ClientId;
 use crate::embedded::timed::{BusClock, RoundEffects, TimedBus, TimedBusOptions};
@@ -24,16 +29,38 @@ impl Server {
         self.timed = Some(Box::new(TimedRounds {
             bus: TimedBus::new(options)?,
             clock: BusClock::start(),
+            timer: None,
             wall_offset: 0,
             effects: RoundEffects::default(),
         }));
         Ok(self)
     }
 
-    /// Returns the time until a round must end; `None` if no frame waits.
-    pub(super) fn time_to_round_end(&self) -> Option<Duration> {
-        let timed = self.timed.as_ref()?;
-        Some(Duration::from_nanos(timed.bus.wake_time()?.saturating_sub(timed.clock.now())))
+    /// Creates the timer for the ends of rounds, if the bus is timed.
+    pub(super) fn create_round_timer(&mut self) -> Result<(), Errno> {
+        let Some(timed) = &mut self.timed else { return Ok(()) };
+        let timer =
+            timerfd_create(TimerfdClockId::Monotonic, TimerfdFlags::CLOEXEC | TimerfdFlags::NONBLOCK)?;
+        epoll::add(&self.post.epoll, &timer, EventData::new_u64(ROUND_END), EventFlags::IN)?;
+        timed.timer = Some(timer);
+        Ok(())
+    }
+
+    /// Sets the timer to the time at which a round must end, or stops it if no frame waits. Either way it is no longer
+    /// readable.
+    pub(super) fn set_round_timer(&self) -> Result<(), Errno> {
+        let Some(timed) = &self.timed else { return Ok(()) };
+        let Some(timer) = &timed.timer else { return Ok(()) };
+        // A time of 0 would stop the timer.
+        let nanos = timed.bus.wake_time().map_or(0, |at| at.saturating_sub(timed.clock.now()).max(1));
+        let wait = Timespec::try_from(Duration::from_nanos(nanos)).map_err(|_| Errno::RANGE)?;
+        let never = Timespec { tv_sec: 0, tv_nsec: 0 };
+        timerfd_settime(
+            timer,
+            TimerfdTimerFlags::empty(),
+            &Itimerspec { it_interval: never, it_value: wait },
+        )?;
+        Ok(())
     }
 
     pub(super) fn begin_timed_round(&mut self) {
@@ -83,7 +110,7 @@ impl Server {
             }
             Ok((0, _)) => {
                 // The other end is closed, which would be reported without end.
-                let _ = rustix::event::epoll::delete(&self.post.epoll, *requests);
+                let _ = epoll::delete(&self.post.epoll, *requests);
                 *reports = None;
             }
             Err(_) => {}
