@@ -12,7 +12,7 @@ fn the_moving_arm_is_run_recorded_drawn_and_rated() {
     let place = TestDir::new();
     let ended = place.start("skinbus", "experiment fig7 fig6 fig8 --quick -o results").end();
     assert!(ended.status.success(), "{}", ended.stderr);
-    assert!(ended.stderr.contains("fig6: torques of the moving arm"), "{}", ended.stderr);
+    assert!(ended.stderr.contains("fig6: joint torques of the moving arm"), "{}", ended.stderr);
     let results: Value = serde_json::from_str(&place.read("results/results.json")).unwrap();
     let experiments = results["experiments"].as_array().unwrap();
     let named: Vec<_> = experiments.iter().map(|experiment| experiment["name"].as_str().unwrap()).collect();

@@ -420,7 +420,8 @@ fn kill_again_and_again(seed: u64, times: u32) -> Vec<f64> {
         if number % 2 == 0 {
             let ended = place.start("skinbus", "recover run.mcap.part").end().succeeded();
             assert!(
-                ended.stdout.starts_with("run-recovered.mcap, ") && ended.stdout.contains(" messages, "),
+                ended.stdout.starts_with("run-recovered.mcap, ")
+                    && ended.stdout.contains(" messages recovered, "),
                 "{ended:#?}"
             );
             fs::remove_file(part).unwrap();

@@ -55,6 +55,7 @@ fn a_recording_comes_message_for_message_as_it_is_in_the_file() {
     let view = served(&place, "fd.mcap", "");
     let mut viewer = Viewer::new(&viewer_url(&view));
     assert_eq!(viewer.info["capabilities"], serde_json::json!(["time"]));
+    let in_order = messages_of(&[place.path("fd.mcap")]);
     let file = by_topic(messages_of(&[place.path("fd.mcap")]));
     let advertised: BTreeSet<_> = viewer.channels.values().map(|it| it["topic"].as_str().unwrap()).collect();
     assert!(file.keys().all(|topic| advertised.contains(topic.as_str())), "{advertised:?}");
@@ -90,8 +91,10 @@ fn a_recording_comes_message_for_message_as_it_is_in_the_file() {
     let mut awaited = BTreeSet::from(["/can/vcan0", "/gateway/timing", "/diagnostics"]);
     viewer.read_until("the state there", |viewer, all| {
         if let Some(TopicMessage { topic, nanos, message }) = all.last() {
-            let before = file[topic].iter().rfind(|it| it.0 <= at);
-            if before.is_some_and(|it| (it.0, &it.1) == (*nanos, message)) {
+            // Some messages are in the file after later ones; reading ends at the first that is later than the position.
+            let read = in_order.iter().take_while(|it| it.nanos <= at);
+            let before = read.filter(|it| it.topic == *topic).last();
+            if before.is_some_and(|it| (it.nanos, &it.message) == (*nanos, message)) {
                 awaited.remove(topic.as_str());
             }
         }
@@ -219,7 +222,7 @@ fn viewers_that_sleep_or_talk_nonsense_disturb_neither_the_bench_nor_others() {
     // More than fits into the queue of the viewer that sleeps, and into the buffers of its socket.
     let mut first = viewers.pop().unwrap();
     let came = first.read_until("many messages", |_, all| all.len() > 40_000);
-    assert!(came.iter().rev().take(1_000).any(|it| it.topic == "/diagnostics"));
+    assert!(came.iter().rev().take(20_000).any(|it| it.topic == "/diagnostics"));
     for viewer in &mut viewers {
         viewer.read_until("further messages", |_, all| all.len() > 100);
     }

@@ -358,8 +358,12 @@ fn what_was_ignored_is_said_at_the_end() {
 
 /// Starts a server with a limit of open files, given as an option of `ulimit`.
 fn serve_with_files(directory: &Path, limit: &str) -> Served {
-    let mut command = Command::new("sh");
-    let line = format!("ulimit {limit} && exec \"$0\" serve vcan0");
+    // Other tests may pass on descriptors of theirs, which would count.
+    let mut command = Command::new("bash");
+    let line = format!(
+        "for fd in $(ls /proc/$$/fd); do [ $fd -le 2 ] || [ $fd = 255 ] || eval \"exec $fd>&-\"; done; \
+         ulimit {limit} && exec \"$0\" serve vcan0"
+    );
     command.args(["-c", &line]).arg(program("vcan-setup")).env("SKINBUS_DIR", directory);
     let (child, line) = Served::start(command.stderr(Stdio::piped()));
     assert!(line.starts_with("serving vcan0 at "), "{line}");
