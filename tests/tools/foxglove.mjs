@@ -25,7 +25,8 @@ client.on("error", (error) => {
   console.error(String(error));
   process.exit(1);
 });
-client.on("close", () => process.exit(0));
+// What was written to a pipe has to be read before the end.
+client.on("close", () => process.stdout.write("", () => process.exit(0)));
 client.on("status", (status) => console.log(JSON.stringify({ status })));
 client.on("serverInfo", (info) => console.log(JSON.stringify({ info })));
 client.on("advertise", (advertised) => {

@@ -122,6 +122,7 @@ $("find").onsubmit = (event) => {
 
 function fit() {
   camera.fit();
+  camera.follow(pose, pose, 0, 0, ...size());
   redraw();
 }
 
