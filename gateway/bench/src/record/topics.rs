@@ -19,15 +19,10 @@ use trace::recording::message_sink::{ChannelSink, MessageSink};
 use trace::ros2::robot::{StringMessage, Transforms};
 use trace::ros2::skin::{ContactState, LoopTiming, PatchState, Torques};
 use trace::ros2::standard::{Diagnosis, DiagnosisLevel, Diagnostics, JointState, Point, PointCloud};
+use trace::ros2::topic::{LATCHED_QOS, QOS_KEY};
 
-/// QoS profile that bag tools store for latched topics: readers that join later get the last message.
-const LATCHED_QOS: (&str, &str) = (
-    "offered_qos_profiles",
-    "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline:\n    sec: 9223372036\n    \
-     nsec: 854775807\n  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n  liveliness: 1\n  \
-     liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n  \
-     avoid_ros_namespace_conventions: false\n",
-);
+/// The metadata of latched topics.
+const LATCHED: (&str, &str) = (QOS_KEY, LATCHED_QOS);
 const TIMING_TOPIC: &str = "/gateway/timing";
 const DIAGNOSTICS_TOPIC: &str = "/diagnostics";
 const TF_TOPIC: &str = "/tf";
@@ -85,11 +80,11 @@ impl Topics {
         let patches = patches.collect::<io::Result<_>>()?;
         let robot = layout.robot.is_some().then(|| {
             let moving = writer.add_channel::<Transforms<'_>>(TF_TOPIC, &[])?;
-            let still = writer.add_channel::<Transforms<'_>>(TF_STATIC_TOPIC, &[LATCHED_QOS])?;
+            let still = writer.add_channel::<Transforms<'_>>(TF_STATIC_TOPIC, &[LATCHED])?;
             Ok::<_, io::Error>([
                 moving,
                 still,
-                writer.add_channel::<StringMessage<'_>>(ROBOT_DESCRIPTION_TOPIC, &[LATCHED_QOS])?,
+                writer.add_channel::<StringMessage<'_>>(ROBOT_DESCRIPTION_TOPIC, &[LATCHED])?,
             ])
         });
         let [states, _, torques] = arm_topics(layout);

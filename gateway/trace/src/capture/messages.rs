@@ -14,13 +14,10 @@ use super::place::{SeekIndex, SeekPoint};
 use crate::container::{
     Chunk, FormatError, FramedRecord, MAX_RECORD_BYTES, NameBudget, Record, RecordReader, parse,
 };
+use crate::ros2::topic::{QOS_KEY, is_latched};
 
 /// The number of bytes that are read at once.
 const READ_BYTES: usize = 1 << 18;
-/// The key of a channel's metadata that holds the quality of service with which a ROS 2 topic was offered.
-const QOS_KEY: &str = "offered_qos_profiles";
-/// The line of a quality of service by which a topic is latched: readers that join later get the last message.
-const TRANSIENT_LOCAL: &str = "durability: 1\n";
 
 /// A topic as a recording describes it.
 #[derive(Clone, Debug, Eq, PartialEq)]
@@ -262,7 +259,7 @@ impl MessageReader {
                     schema_name,
                     schema_encoding,
                     schema,
-                    is_latched: facts.get(QOS_KEY).is_some_and(|qos| qos.contains(TRANSIENT_LOCAL)),
+                    is_latched: facts.get(QOS_KEY).is_some_and(is_latched),
                 };
                 let index = self.channels.iter().position(|known| *known == described);
                 let index = index.unwrap_or_else(|| {

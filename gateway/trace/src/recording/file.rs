@@ -20,6 +20,7 @@ use super::BUS_TOPIC_PREFIX;
 use super::output::SharedOutput;
 use crate::container::{FramedRecord, Record, RecordReader, parse};
 use crate::ros2::Message;
+use crate::ros2::topic::{MESSAGE_ENCODING, QOS_KEY, SCHEMA_ENCODING};
 
 /// The size of a chunk in bytes before compression. Compressing a larger chunk would block the writer for so long that
 /// its queues fill up.
@@ -237,14 +238,13 @@ impl<W: Write> FileWriter<W> {
     /// # Errors
     /// Returns an error if the file cannot be written.
     pub fn channel<M: Message>(&mut self, topic: &str, facts: &[(&str, &str)]) -> io::Result<Channel> {
-        // Bag tools require the key, and accept an empty value.
-        let qos = ("offered_qos_profiles", "");
+        let qos = (QOS_KEY, "");
         let facts = [&qos].into_iter().chain(facts).map(|&(key, value)| (key.to_owned(), value.to_owned()));
         let (facts, definition) = (facts.collect(), M::DEFINITION.as_bytes());
-        let schema = self.writer.add_schema(M::TYPE, "ros2msg", definition).map_err(io_error)?;
-        self.describe_schema(schema, (M::TYPE, "ros2msg"), definition);
-        let id = self.writer.add_channel(schema, topic, "cdr", &facts).map_err(io_error)?;
-        self.describe_channel((id, schema), (topic, "cdr"), &facts);
+        let schema = self.writer.add_schema(M::TYPE, SCHEMA_ENCODING, definition).map_err(io_error)?;
+        self.describe_schema(schema, (M::TYPE, SCHEMA_ENCODING), definition);
+        let id = self.writer.add_channel(schema, topic, MESSAGE_ENCODING, &facts).map_err(io_error)?;
+        self.describe_channel((id, schema), (topic, MESSAGE_ENCODING), &facts);
         Ok(Channel { id, sequence: 0, is_frames: is_frame_channel(topic, M::TYPE) })
     }
 

@@ -9,6 +9,7 @@ pub mod read;
 pub mod robot;
 pub mod skin;
 pub mod standard;
+pub mod topic;
 
 use cdr::{CdrError, CdrReader, CdrWriter, Decode, Encode};
 use thiserror::Error;

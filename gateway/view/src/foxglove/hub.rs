@@ -8,17 +8,11 @@ use trace::capture::ChannelDescription;
 use trace::recording::file::Channel;
 use trace::recording::message_sink::{ChannelSink, MessageSink};
 use trace::ros2::Message;
+use trace::ros2::topic::{MESSAGE_ENCODING, QOS_KEY, SCHEMA_ENCODING, is_latched};
 
 use super::protocol::{AdvertisedChannel, ClientMessage, StatusLevel, advertise, server_info, status, time};
 use super::queue::{QueuedMessage, ViewerQueue};
 use crate::lock_ignoring_poison;
-
-/// The encoding of all messages that this program writes.
-const MESSAGE_ENCODING: &str = "cdr";
-/// The language of all definitions that this program writes.
-const SCHEMA_ENCODING: &str = "ros2msg";
-/// The key of a channel's metadata that holds the quality of service of a latched topic.
-const QOS_KEY: &str = "offered_qos_profiles";
 
 /// A channel with its last message, if viewers that subscribe later need it.
 #[derive(Debug)]
@@ -203,7 +197,7 @@ impl ChannelSink for HubSink {
             schema_name: M::TYPE.to_owned(),
             schema_encoding: SCHEMA_ENCODING.to_owned(),
             schema: M::DEFINITION.as_bytes().to_vec(),
-            is_latched: facts.iter().any(|(key, value)| *key == QOS_KEY && !value.is_empty()),
+            is_latched: facts.iter().any(|(key, value)| *key == QOS_KEY && is_latched(value)),
         });
         let id = u16::try_from(id).map_err(|_| io::Error::other("there are more than 65536 topics"))?;
         Ok(Channel::with_id(id))
