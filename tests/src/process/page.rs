@@ -53,13 +53,18 @@ impl Address {
 
 /// Returns the address that the server of a run or a view reports.
 pub fn address(served: &Running) -> Address {
-    served.wait_for_stderr("view: http://");
+    Address::parse(&announced_url(served, "view", "http"))
+}
+
+/// Returns the URL that a program reports on standard error, after a word and a colon.
+pub fn announced_url(served: &Running, word: &str, scheme: &str) -> String {
+    served.wait_for_stderr(&format!("{word}: {scheme}://"));
     let said = || {
         let said = served.stderr();
-        let (line, _) = said.split_once("view: ")?.1.split_once('\n')?;
+        let (line, _) = said.split_once(&format!("{word}: "))?.1.split_once('\n')?;
         Some(line.trim_end().to_owned())
     };
-    Address::parse(&until("the whole address", said))
+    until("the whole address", said)
 }
 
 /// Requests a WebSocket, with additional or different headers.
@@ -67,9 +72,17 @@ pub fn request_websocket(
     Address { host, query }: &Address,
     headers: &[(&'static str, &str)],
 ) -> Result<(WebSocket<TcpStream>, u16), Error> {
-    let stream = TcpStream::connect(host).unwrap();
+    shake_hands(TcpStream::connect(host).unwrap(), &format!("ws://{host}/live{query}"), headers)
+}
+
+/// Requests a WebSocket on a connection, with additional or different headers.
+pub fn shake_hands(
+    stream: TcpStream,
+    url: &str,
+    headers: &[(&'static str, &str)],
+) -> Result<(WebSocket<TcpStream>, u16), Error> {
     stream.set_read_timeout(Some(TIMEOUT)).unwrap();
-    let mut request = format!("ws://{host}/live{query}").into_client_request()?;
+    let mut request = url.into_client_request()?;
     for (name, value) in headers {
         request.headers_mut().insert(*name, value.parse().unwrap());
     }

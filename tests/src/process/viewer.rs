@@ -8,10 +8,10 @@ use std::time::Instant;
 use rustix::net::sockopt::set_socket_recv_buffer_size;
 use rustix::net::{AddressFamily, SocketType, connect, socket};
 use serde_json::{Value, json};
-use tungstenite::client::IntoClientRequest;
-use tungstenite::{Error, Message, WebSocket, client};
+use tungstenite::{Error, Message, WebSocket};
 
-use super::{Running, TIMEOUT, until};
+use super::page::{announced_url, shake_hands};
+use super::{Running, TIMEOUT};
 
 /// The size of the receive buffer of a viewer's socket, in bytes: small, so that a viewer that sleeps is noticed soon.
 const RECEIVE_BUFFER_BYTES: usize = 8 << 10;
@@ -37,13 +37,7 @@ pub struct TopicMessage {
 
 /// Returns the address that a view reports for viewers, such as `ws://127.0.0.1:8765`.
 pub fn viewer_url(served: &Running) -> String {
-    served.wait_for_stderr("foxglove: ws://");
-    let said = || {
-        let said = served.stderr();
-        let (line, _) = said.split_once("foxglove: ")?.1.split_once('\n')?;
-        Some(line.trim_end().to_owned())
-    };
-    until("the whole address", said)
+    announced_url(served, "foxglove", "ws")
 }
 
 /// Requests a WebSocket with these headers.
@@ -52,17 +46,7 @@ pub fn request(url: &str, headers: &[(&'static str, &str)]) -> Result<WebSocket<
     let connected = socket(AddressFamily::INET, SocketType::STREAM, None).unwrap();
     set_socket_recv_buffer_size(&connected, RECEIVE_BUFFER_BYTES).unwrap();
     connect(&connected, &host).unwrap();
-    let stream = TcpStream::from(connected);
-    stream.set_read_timeout(Some(TIMEOUT)).unwrap();
-    let mut request = url.into_client_request()?;
-    for (name, value) in headers {
-        request.headers_mut().insert(*name, value.parse().unwrap());
-    }
-    match client(request, stream) {
-        Ok((socket, _)) => Ok(socket),
-        Err(tungstenite::HandshakeError::Failure(error)) => Err(error),
-        Err(tungstenite::HandshakeError::Interrupted(_)) => panic!("no answer"),
-    }
+    Ok(shake_hands(TcpStream::from(connected), url, headers)?.0)
 }
 
 impl Viewer {
