@@ -16,6 +16,7 @@ use crate::report::figure::{
     Axis, Figure, Finding, MarkLine, Page, Section, Series, SeriesShape, format_number, format_quantity,
 };
 use crate::report::thin::ThinnedLine;
+use crate::shadow::BusShadow;
 use model::table::{CellState, TorqueAccuracy, UplinkCounts};
 
 /// The paper's number of cells, control loop rate and broadcast rate.
@@ -33,10 +34,14 @@ struct PageDraft<'a> {
     run: &'a RunData,
     /// Start of the loop, or of the joints in a capture with frames only, in s after the recording's first message.
     zero: f64,
+    /// The timing on the real bus, for each bus of the skin with frames.
+    bus_shadows: Vec<BusShadow>,
 }
 
 pub(super) fn report_page(run: &RunData, command: &str, missing: Option<&str>) -> Page {
-    let draft = PageDraft { run, zero: run.motion.first.unwrap_or(0.0) };
+    let bus_shadows = run.shadow.report().buses;
+    let bus_shadows = bus_shadows.into_iter().filter(|bus| run.skin.bus_index(&bus.bus).is_some()).collect();
+    let draft = PageDraft { run, zero: run.motion.first.unwrap_or(0.0), bus_shadows };
     let mut intro = match &run.frames_only {
         Some(frames_only) => intro_of_frames(run, frames_only),
         None => intro_of_run(run),

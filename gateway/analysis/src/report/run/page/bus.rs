@@ -180,16 +180,10 @@ impl PageDraft<'_> {
         rates.filter(|(x, _)| *x >= 0.0).collect()
     }
 
-    /// Returns the timing on the real bus, for each bus with frames.
-    fn bus_shadows(&self) -> impl Iterator<Item = BusShadow> {
-        let buses = self.run.shadow.report().buses;
-        buses.into_iter().filter(|bus| self.run.skin.bus_index(&bus.bus).is_some())
-    }
-
     /// Returns a line at the latest end of the last reply in the worst case, if frames take time on the bus. `None`
     /// without such an upper bound.
     fn last_reply_bound(&self, bus_figures: &BusFigures) -> Option<MarkLine> {
-        self.bus_shadows().find(|bus| bus.bus == bus_figures.name && bus.is_timed)?;
+        self.bus_shadows.iter().find(|bus| bus.bus == bus_figures.name && bus.is_timed)?;
         let skin = &self.run.skin;
         let worst =
             fit::assess_worst_case(skin, skin.bus_index(&bus_figures.name)?, bus_figures.rates.rates)?;
@@ -205,7 +199,7 @@ impl PageDraft<'_> {
             "load at most 100 %, replies before the next joints message, at most \
                               {MAX_NODES_PER_BUS} nodes"
         );
-        for bus in self.bus_shadows() {
+        for bus in &self.bus_shadows {
             let bus_figures = self.run.bus_figures.iter().find(|bus_figures| bus_figures.name == bus.bus);
             let origin = bus_figures.and_then(|bus_figures| bus_figures.rates_from);
             for answer in bus.this_run.iter().chain(&bus.worst_case) {
@@ -238,9 +232,9 @@ impl PageDraft<'_> {
                 )
                 .with_marks([MarkLine::at_y(100.0, "full load")])
         };
-        let (timed, untimed): (Vec<_>, Vec<_>) = self.bus_shadows().partition(|bus| bus.is_timed);
+        let (timed, untimed): (Vec<_>, Vec<_>) = self.bus_shadows.iter().partition(|bus| bus.is_timed);
         let names =
-            |buses: &[BusShadow]| buses.iter().map(|bus| bus.bus.as_str()).collect::<Vec<_>>().join(", ");
+            |buses: &[&BusShadow]| buses.iter().map(|bus| bus.bus.as_str()).collect::<Vec<_>>().join(", ");
         let mut section = Section::new("load", "Load of the buses");
         if !untimed.is_empty() {
             section = section.with_paragraph(format!(
@@ -269,7 +263,7 @@ impl PageDraft<'_> {
         }
         section
             .with_figures(self.run.bus_figures.iter().map(figure).filter_map(without_empty_series))
-            .with_tables(self.bus_shadows().map(|bus| load_table(&bus)))
+            .with_tables(self.bus_shadows.iter().map(load_table))
     }
 
     pub(super) fn losses_section(&self) -> Section {
