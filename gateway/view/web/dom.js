@@ -7,6 +7,14 @@ export function element(tag, text, className) {
   return it;
 }
 
+// A button with a text, a name for screen readers, and a title.
+export function button(text, label, click, title = label) {
+  const it = element("button", text);
+  Object.assign(it, { type: "button", title, onclick: click });
+  it.setAttribute("aria-label", label);
+  return it;
+}
+
 // Makes the content of a box equal to these elements, and keeps elements that are equal already: drawing text again is
 // expensive in software, and would remove a user's selection. What handles events does not belong here: it stays that of before.
 export function show(box, fresh) {

@@ -6,6 +6,9 @@ import { DEAD } from "./snapshot.js";
 // The kinds, the most important first. Of many events the labels of these are shown first.
 export const KINDS = { halt: "Halt", command: "Command", bus: "Bus", silence: "Silent cell", touch: "Touch", loss: "Loss" };
 const RANKS = Object.keys(KINDS);
+// The name of the colour of a kind.
+const COLOURS = { touch: "--distributed", loss: "--central", bus: "--ink", command: "--ink" };
+export const colourOf = (kind) => COLOURS[kind] ?? "--alarm";
 export const rankOf = (kind) => RANKS.indexOf(kind);
 // Losses that follow each other within this time in s are one event.
 const ONE_LOSS_S = 1;

@@ -2,10 +2,11 @@
 
 import { css } from "./colours.js";
 import { Recent, Recorded, decodeCurves, isBack, points } from "./curves.js";
-import { element } from "./dom.js";
+import { button, element } from "./dom.js";
 import { EventLog } from "./events.js";
 import { LEFT, Lane, RIGHT, sized } from "./lane.js";
 import { followed, secondDigits, ticks, within, zoomed } from "./scale.js";
+import { DEAD } from "./snapshot.js";
 import { Strip } from "./strip.js";
 import { moment } from "./time.js";
 
@@ -33,12 +34,6 @@ export class Plots {
   }
 
   build() {
-    const button = (text, label, click) => {
-      const it = element("button", text);
-      Object.assign(it, { type: "button", title: label, onclick: click });
-      it.setAttribute("aria-label", label);
-      return it;
-    };
     this.what = element("select");
     this.what.id = "plotted";
     const label = element("label", "Plot");
@@ -111,7 +106,7 @@ export class Plots {
     // The last torques of a joint whose buses are down are none of now.
     this.torques.add(time, joints.flatMap(({ distributed, central }, at) => (this.down.has(at) ? [NaN, NaN] : [distributed, central])));
     const forces = new Uint16Array(this.scene.cells.length);
-    for (let i = 0; i < forces.length; i++) forces[i] = (cells[2 * i] & 255) === 4 ? NO_FORCE : Math.min(NO_FORCE - 1, cells[2 * i] >>> 16);
+    for (let i = 0; i < forces.length; i++) forces[i] = (cells[2 * i] & 255) === DEAD ? NO_FORCE : Math.min(NO_FORCE - 1, cells[2 * i] >>> 16);
     this.forces.add(time, forces);
     this.log.see(this.scene, snapshot);
   }

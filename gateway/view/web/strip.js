@@ -1,7 +1,7 @@
 // The events above the plots: labels that do not overlap, and marks for those without room. A click goes there.
 
 import { element } from "./dom.js";
-import { labelOf, rankOf } from "./events.js";
+import { colourOf, labelOf, rankOf } from "./events.js";
 import { groups, rowsOf } from "./scale.js";
 import { clock } from "./time.js";
 
@@ -10,7 +10,6 @@ const [GAP, ROW, ROWS] = [4, 24, 2];
 // Events of one kind that are nearer to each other than this share a label.
 const TOGETHER = 44;
 const MOST_LABELS = 80;
-const COLOURS = { touch: "--distributed", loss: "--central", halt: "--alarm", silence: "--alarm", bus: "--ink", command: "--ink" };
 
 export class Strip {
   constructor(go, redraw) {
@@ -64,7 +63,7 @@ export class Strip {
   button(key, { kind, at }) {
     const it = element("button");
     it.type = "button";
-    it.style.setProperty("--of", `var(${COLOURS[kind]})`);
+    it.style.setProperty("--of", `var(${colourOf(kind)})`);
     it.onclick = () => this.go(at);
     this.buttons.set(key, it);
     this.box.append(it);

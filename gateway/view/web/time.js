@@ -1,8 +1,8 @@
 // The time line of a recording: the position, the events, and the playback controls.
 
 import { css } from "./colours.js";
-import { element } from "./dom.js";
-import { KINDS } from "./events.js";
+import { button, element } from "./dom.js";
+import { KINDS, colourOf } from "./events.js";
 
 const SPEEDS = [0.05, 0.1, 0.25, 0.5, 1, 2, 5, 10, 20];
 const PARTS = 600;
@@ -27,14 +27,6 @@ export function requested(fragment) {
 export class TimeBar {
   constructor(box, send) {
     Object.assign(this, { box, send, playback: null, dragged: null, marked: "" });
-    const button = (text, label, click, title = label) => {
-      const it = element("button", text);
-      it.type = "button";
-      it.title = title;
-      it.setAttribute("aria-label", label);
-      it.onclick = click;
-      return it;
-    };
     this.play = button("Play", "Play", () => this.toggle());
     this.back = button("−1", "−1 epoch", () => send({ do: "step", forward: false }), "Previous epoch");
     this.forth = button("+1", "+1 epoch", () => send({ do: "step", forward: true }), "Next epoch");
@@ -146,7 +138,7 @@ export class TimeBar {
     pen.fillStyle = css("--line");
     pen.fillRect(0, 0, w * read, h);
     kinds.forEach((kind, row) => {
-      pen.fillStyle = css({ touch: "--distributed", loss: "--central", bus: "--ink", command: "--ink" }[kind] ?? "--alarm");
+      pen.fillStyle = css(colourOf(kind));
       for (const part of marks[kind] ?? []) pen.fillRect(part / PARTS * w, row * 4, Math.max(1.5, w / PARTS), 3);
     });
     const said = kinds.filter((kind) => (marks[kind] ?? []).length).map((kind) => KINDS[kind].toLowerCase());
