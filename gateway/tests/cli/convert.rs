@@ -351,7 +351,7 @@ fn a_full_disk_is_said_and_a_reader_may_leave() {
 }
 
 /// Polls until a condition holds.
-fn until(what: &str, mut so: impl FnMut() -> bool) {
+pub(crate) fn until(what: &str, mut so: impl FnMut() -> bool) {
     let begun = Instant::now();
     while !so() {
         assert!(begun.elapsed() < Duration::from_secs(60), "{what} never came");
@@ -360,7 +360,7 @@ fn until(what: &str, mut so: impl FnMut() -> bool) {
 }
 
 /// Returns true if a process catches SIGINT, by the kernel's report.
-fn catches_interrupts(pid: u32) -> bool {
+pub(crate) fn catches_interrupts(pid: u32) -> bool {
     let status =
         fs::read_to_string(Path::new("/proc").join(pid.to_string()).join("status")).unwrap_or_default();
     let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:"));

@@ -20,6 +20,7 @@ use tempfile::TempDir;
 use vcan_setup::embedded::ServerThread;
 
 use super::*;
+use crate::convert::{catches_interrupts, until};
 
 /// A bus for one test.
 struct Bench {
@@ -315,7 +316,7 @@ fn a_bus_that_comes_later_is_waited_for() {
     }
     let mut waits = dump("--wait -n 1");
     let gives_up = dump("--wait");
-    std::thread::sleep(Duration::from_millis(300));
+    until("the handler", || catches_interrupts(gives_up.id()));
     kill_process(Pid::from_child(&gives_up), Signal::INT).unwrap();
     assert_eq!(gives_up.wait_with_output().unwrap().status.code(), Some(0));
     assert!(waits.try_wait().unwrap().is_none());
