@@ -62,7 +62,9 @@ fn its_program_takes_its_place_with_the_same_words_exit_code_and_signals() {
         assert_eq!(ended.stderr, "");
     }
     for (name, signal) in [("an odd place", Signal::TERM), ("interrupted", Signal::INT)] {
-        let script = place.script(name, "#!/bin/sh\necho ready\nexec /bin/sleep 60\n");
+        // A shell that is interrupted before `exec` ends with an exit code.
+        place.write("ready", "ready\n");
+        let script = place.script(name, "#!/bin/sh\nexec /usr/bin/tail -f ready\n");
         let mut link = command(&place, &program("vcan-setup"), "link vcan0");
         let link = Running::start({
             link.env("SKINBUS_VCAN_LINK", script);
