@@ -41,7 +41,7 @@ impl SocketBus {
     /// Opens a bus. `stopped` interrupts the test; `command` switches the cell off and on.
     ///
     /// # Errors
-    /// Returns [`BusError`] if the bus cannot be used as requested.
+    /// Returns [`BusError`] if the bus cannot be used as requested, or if frames take time on it.
     pub fn open(
         name: &str,
         kind: KindChoice,
@@ -50,7 +50,8 @@ impl SocketBus {
     ) -> Result<Self, BusError> {
         let receive_buffer = GATEWAY_RECEIVE_BUFFER_BYTES as usize;
         let options = BusOptions { own_frames: true, receive_buffer, ..BusOptions::default() };
-        let socket = listen::open_bus(name, kind, None, options)?;
+        // On a timed bus, stimuli and sync overtake what was sent before them.
+        let socket = listen::open_bus(name, kind, None, options)?.without_time()?;
         let (inbox, waiting, late) = (Inbox::new(), VecDeque::new(), Span(0));
         let probe = socket.is_virtual().unwrap_or(false).then(LatenessProbe::new).transpose();
         let probe = probe.map_err(|source| BusError::Io {

@@ -44,7 +44,7 @@ impl RecordedCurves {
     /// Returns the media type and the bytes of an answer; `None` if the query is not valid.
     ///
     /// `/events?from=0&to=9.5` is answered in JSON. `/curves?of=torques&from=0&to=9.5&count=600` has values of
-    /// `torques`, `loads`, `lateness` or `force`, which needs a cell, as in `cell=vcan0:5`. The answer is little-endian:
+    /// `torques`, `loads`, `replies`, `lateness` or `force`, which needs a cell, as in `cell=vcan0:5`. The answer is little-endian:
     ///
     /// | bytes | content |
     /// |---|---|
@@ -74,6 +74,7 @@ impl RecordedCurves {
                 let curve = match value("of")? {
                     "torques" => Curve::Torques,
                     "loads" => Curve::Loads,
+                    "replies" => Curve::Replies,
                     "lateness" => Curve::Lateness,
                     "force" => {
                         // Browsers may escape the colon.

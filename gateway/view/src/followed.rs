@@ -5,8 +5,10 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use bench::bus::figures::TimedFigures;
 use bench::bus::follow::{BusSource, FollowStep, Follower};
 use bench::bus::listen::{now, open_bus, send_message};
+use bench::summary::TimedReport;
 use protocol::bus::batch::MAX_BATCH_DATAGRAMS;
 use protocol::bus::{Bus, BusError, BusOptions, KindChoices};
 use protocol::can::Format;
@@ -31,6 +33,7 @@ pub(crate) struct FollowedBus {
     bus: Mutex<Option<Arc<Bus>>>,
     /// The time in µs up to which all frames have been applied, or are about to be.
     read_to: AtomicU64,
+    figures: Mutex<TimedFigures>,
 }
 
 /// Opens buses of a kind that the user chose.
@@ -90,6 +93,7 @@ impl FollowedBus {
             format: described.format,
             bus: Mutex::new(bus),
             read_to: AtomicU64::new(u64::MAX),
+            figures: Mutex::new(TimedFigures::new(&described.name, opener.directory)),
         })
     }
 
@@ -115,6 +119,16 @@ impl FollowedBus {
             apply(&mut follower);
             self.read_to.store(read_to, Ordering::Relaxed);
         }
+    }
+
+    /// Returns true if frames take time on the bus, so that their time stamps are their ends.
+    pub(crate) fn is_timed(&self) -> bool {
+        lock_ignoring_poison(&self.bus).as_ref().is_some_and(|bus| bus.is_timed())
+    }
+
+    /// Returns the figures of a timed bus that have come from its server since the last call. Does not wait.
+    pub(crate) fn poll_figures(&self) -> Option<TimedReport> {
+        if self.is_timed() { lock_ignoring_poison(&self.figures).poll() } else { None }
     }
 
     /// Sends a message. Returns false if the bus does not take it; it then counts as a lost frame.

@@ -21,6 +21,7 @@ use trace::ros2::skin::LoopTiming;
 
 use self::halts::HaltReasons;
 use self::series::{Series, SeriesPart};
+use crate::live::LiveState;
 use crate::lock_ignoring_poison;
 use crate::tape::{Event, EventDetector, EventKind, MAX_EVENTS, PlaybackState, PlaybackStep};
 
@@ -71,6 +72,8 @@ struct Curves {
     torques: Series,
     /// The load of each bus.
     loads: Series,
+    /// For each timed bus, the longest time from joints to a reply to them, in ms.
+    replies: Series,
     /// The lateness of the loop's ticks in µs.
     lateness: Series,
     /// The force on each cell in N, in the order of `cells`.
@@ -85,6 +88,8 @@ pub enum Curve {
     Torques,
     /// The load of each bus.
     Loads,
+    /// The longest time from joints to a reply on each bus, in ms; no value on a bus on which frames take no time.
+    Replies,
     /// The lateness of the control loop in µs.
     Lateness,
     /// The force on a cell of a bus, in N.
@@ -98,17 +103,21 @@ impl Curves {
         };
         Self {
             torques: series(3 * skin.robot.joints.len(), 2),
-            loads: series(skin.buses.len(), 4),
-            lateness: series(1, 4),
+            loads: series(skin.buses.len(), 6),
+            replies: series(skin.buses.len(), 6),
+            lateness: series(1, 6),
             forces: series(skin.cells.len(), 1),
             cells: Vec::new(),
         }
     }
 
     #[expect(clippy::cast_possible_truncation, reason = "to be drawn")]
-    fn add_torques(&mut self, at: u64, torques: &[[f64; 2]]) {
-        let values = torques.iter().flat_map(|&[cells, central]| [cells, central, cells - central]);
+    fn add_epoch(&mut self, at: u64, live: &LiveState) {
+        let torques = live.joint_torques().into_iter();
+        let values = torques.flat_map(|[cells, central]| [cells, central, cells - central]);
         self.torques.add(at, values.map(|value| value as f32));
+        let replies = live.longest_reply_ms_by_bus();
+        self.replies.add(at, replies.map(|value| value.map_or(f32::NAN, |value| value as f32)));
     }
 
     /// Returns the values that belong to a curve.
@@ -116,6 +125,7 @@ impl Curves {
         match curve {
             Curve::Torques => (&self.torques, 0..self.torques.quantity_count()),
             Curve::Loads => (&self.loads, 0..self.loads.quantity_count()),
+            Curve::Replies => (&self.replies, 0..self.replies.quantity_count()),
             Curve::Lateness => (&self.lateness, 0..1),
             Curve::Force(bus, node) => match self.cells.iter().position(|cell| *cell == (bus, node)) {
                 Some(place) => (&self.forces, place..place + 1),
@@ -184,8 +194,7 @@ impl RecordingIndex {
                     }
                 }
                 PlaybackStep::Applied { epoch: true } if tape.position_ns() >= next_torques => {
-                    let torques = tape.live().joint_torques();
-                    lock_ignoring_poison(&self.0).curves.add_torques(tape.position_ns(), &torques);
+                    lock_ignoring_poison(&self.0).curves.add_epoch(tape.position_ns(), tape.live());
                     next_torques = tape.position_ns().saturating_add(MIN_TORQUE_INTERVAL_NS);
                 }
                 PlaybackStep::Applied { .. } | PlaybackStep::Reached | PlaybackStep::Over => {}

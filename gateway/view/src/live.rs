@@ -2,9 +2,11 @@
 
 pub(crate) mod bus;
 mod recent;
+mod replies;
 mod said;
 
 use bench::record::feed::EpochContacts;
+use bench::summary::TimedReport;
 use model::table::CellStatus;
 use protocol::can::Frame;
 use protocol::id::CellId;
@@ -15,7 +17,7 @@ use self::bus::LiveBus;
 pub use self::recent::{DecodedFrame, RecentFrames, TorqueExplanation};
 pub use self::said::{
     BusStatus, CellDetail, CellParentAndWires, DeadCell, GainsAndThresholds, SensorReading, StatusMessage,
-    TorqueReply,
+    TimedBusStatus, TorqueReply, TransmitQueues,
 };
 use crate::pressed::{CellKey, TouchRegistry};
 use protocol::message::{Message, SkinSensors};
@@ -148,6 +150,12 @@ impl LiveState {
         self.buses.iter().map(LiveBus::bus_load)
     }
 
+    /// Returns for each bus the longest time in ms from joints to a reply to them, of the replies between the last two
+    /// joints; `None` without a reply, and on a bus on which frames take no time.
+    pub fn longest_reply_ms_by_bus(&self) -> impl Iterator<Item = Option<f64>> {
+        self.buses.iter().map(|bus| bus.reply_times()?.longest_of_epoch_ms())
+    }
+
     /// Returns true if any bus is halted.
     #[must_use]
     pub fn is_halted(&self) -> bool {
@@ -217,6 +225,20 @@ impl LiveState {
     pub fn set_bus_state(&mut self, bus: usize, is_up: bool, dropped: u64) {
         if let Some(bus) = self.buses.get_mut(bus) {
             bus.set_state(is_up, dropped);
+        }
+    }
+
+    /// Sets whether frames take time on a bus, so that their time stamps are their ends.
+    pub fn set_bus_timed(&mut self, bus: usize, is_timed: bool) {
+        if let Some(bus) = self.buses.get_mut(bus) {
+            bus.set_timed(is_timed);
+        }
+    }
+
+    /// Sets the figures that the server of a timed bus reports.
+    pub fn set_bus_figures(&mut self, bus: usize, figures: TimedReport) {
+        if let Some(of) = self.buses.get_mut(bus) {
+            of.set_figures(&self.skin, bus, figures);
         }
     }
 

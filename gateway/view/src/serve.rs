@@ -131,6 +131,7 @@ pub fn serve(
                     });
                     let dropped = follower.dropped_frames();
                     live.set_bus_state(index, !follower.is_lost(), dropped);
+                    live.set_bus_timed(index, bus.is_timed());
                     if let Some(topics) = &mut viewers {
                         topics.publish_state(index, &live, dropped);
                     }
@@ -225,6 +226,11 @@ fn publish_and_execute(
             let message = Message::Stimulus { to: Node::Cell(node), from: StimulusStart::Next, page };
             if let Some(bus) = buses.get(bus) {
                 let _ = bus.send(&message);
+            }
+        }
+        for (index, bus) in buses.iter().enumerate() {
+            if let Some(figures) = bus.poll_figures() {
+                lock_ignoring_poison(live).set_bus_figures(index, figures);
             }
         }
         next = (next + SNAPSHOT_INTERVAL).max(Instant::now());

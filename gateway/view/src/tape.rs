@@ -122,6 +122,9 @@ impl PlaybackState {
 
     /// Stores the frames that were latched when the recording began. Must be called before the first entry is added.
     pub fn set_latched_frames(&mut self, extras: &RecordingExtras) {
+        for bus in extras.timed_buses().filter_map(|bus| self.bus_index(bus)).collect::<Vec<_>>() {
+            self.live.set_bus_timed(bus, true);
+        }
         let latched = extras.latched.iter();
         self.latched = latched
             .filter_map(|it| Some(QueuedFrame { bus: self.bus_index(&it.bus)?, frame: it.frame }))

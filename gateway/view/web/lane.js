@@ -12,7 +12,7 @@ const GAP_S = 1;
 // A lane has no room for all values below this width in pixels.
 const NARROW = 500;
 // The smallest part of a unit that an axis shows.
-const LEAST = { Nm: 0.01, N: 0.1, "%": 1, µs: 10 };
+const LEAST = { Nm: 0.01, N: 0.1, "%": 1, ms: 0.1, µs: 10 };
 export const FONT = "system-ui, \"DejaVu Sans\", sans-serif";
 
 // Makes a canvas as sharp as the screen, and clears it.
@@ -84,7 +84,7 @@ export class Lane {
     pen.save();
     pen.beginPath(); pen.rect(LEFT, 0, view.inside, h); pen.clip();
     pen.lineJoin = "round";
-    this.curves.forEach(([, colour], k) => this.line(pen, curves[k], x, y, theme[colour], colour === "central"));
+    this.curves.forEach(([, colour, isConstant], k) => this.line(pen, curves[k], x, y, theme[colour], colour === "central", isConstant ? Infinity : GAP_S));
     pen.restore();
     const shown = view.cursor ?? view.at;
     if (view.at !== null) this.mark(pen, x(view.at), h, theme.ink, []);
@@ -103,18 +103,18 @@ export class Lane {
     if (document.activeElement === this.canvas) this.say(view);
   }
 
-  line(pen, points, x, y, colour, dashed) {
+  line(pen, points, x, y, colour, dashed, gap) {
     pen.strokeStyle = colour;
     pen.lineWidth = dashed ? 2.5 : 1.5;
     pen.setLineDash(dashed ? [4, 3] : []);
     pen.beginPath();
-    let before = -Infinity;
+    let before = NaN;
     for (let k = 0; k < points.length; k += 3) {
       const [time, low, high] = [points[k], points[k + 1], points[k + 2]];
-      if (Number.isNaN(low)) { before = -Infinity; continue; }
+      if (Number.isNaN(low)) { before = NaN; continue; }
       const across = x(time), [one, other] = [y(low), y(high)];
-      if (time - before > GAP_S) pen.moveTo(across, one);
-      else pen.lineTo(across, one);
+      if (time - before <= gap) pen.lineTo(across, one);
+      else pen.moveTo(across, one);
       if (Math.abs(one - other) > 0.5) pen.lineTo(across, other);
       before = time;
     }
@@ -133,9 +133,9 @@ export class Lane {
   // Reads the values at a time, and shows them as text.
   read(curves, time, near, brief) {
     this.time = time;
-    this.at = curves.map((points) => valueAt(points, time, Math.max(GAP_S, near)));
+    this.at = curves.map((points, k) => valueAt(points, time, this.curves[k][2] ? Infinity : Math.max(GAP_S, near)));
     const named = this.curves.map(([name], k) => [name, this.at[k]]).reverse(), [one, other] = named.map(([, v]) => v);
-    if (named.length > 1 && one !== null && other !== null) named.push(["difference", one - other]);
+    if (this.joint !== undefined && named.length > 1 && one !== null && other !== null) named.push(["difference", one - other]);
     if (brief && named.length > 2) named.splice(1, 1);
     const text = named.every(([, v]) => v === null) ? "–" : `${named.map(([name, v]) => `${named.length > 1 ? `${name} ` : ""}${v === null ? "–" : number(v)}`).join(", ")} ${this.unit}`;
     if (text === this.values) return;

@@ -28,6 +28,8 @@ export class Plots {
     this.torques = new Recent(2 * joints, MOMENTS);
     this.forces = new Recent(cells, Math.max(300, Math.min(MOMENTS, Math.floor(FORCE_BYTES / 2 / Math.max(1, cells)))), Uint16Array, 1e-3);
     this.loads = new Recent(scene.buses.length, MOMENTS / 6);
+    this.replies = new Recent(scene.buses.length, MOMENTS / 6);
+    this.bounds = [];
     this.lateness = new Recent(2, MOMENTS / 6);
     this.recorded = new Recorded((path) => fetch(`${path}&${location.search.slice(1)}`), () => { this.dirty = true; on.redraw(); });
     this.build();
@@ -38,8 +40,8 @@ export class Plots {
     this.what.id = "plotted";
     const label = element("label", "Plot");
     label.htmlFor = "plotted";
-    this.options = ["torque", "difference", "force", "load", "lateness"].map((value) => {
-      const it = element("option", { torque: "torque", difference: "torque: cells − central", force: "force of the chosen cell", load: "load of the buses", lateness: "lateness of the loop" }[value]);
+    this.options = ["torque", "difference", "force", "load", "replies", "lateness"].map((value) => {
+      const it = element("option", { torque: "torque", difference: "torque: cells − central", force: "force of the chosen cell", load: "load of the buses", replies: "slowest reply on timed buses", lateness: "lateness of the loop" }[value]);
       it.value = value;
       return it;
     });
@@ -74,6 +76,7 @@ export class Plots {
       difference: () => scene.joints.map((it, at) => ({ name: joint(it, at), unit: it.torque_unit, curves: [["cells − central", "distributed"]], joint: at })),
       force: () => [{ name: this.chosen < 0 ? "No cell chosen" : `Cell ${scene.buses[scene.cells[this.chosen].bus].name}:${scene.cells[this.chosen].node}`, unit: "N", curves: [["force", "distributed"]] }],
       load: () => scene.buses.map(({ name }, at) => ({ name, unit: "%", curves: [["load", "distributed"]], bus: at })),
+      replies: () => scene.buses.flatMap(({ name }, at) => (this.bounds[at] === undefined ? [] : [{ name, unit: "ms", curves: [["bound", "central", true], ["slowest reply", "distributed"]], bus: at }])),
       lateness: () => [{ name: "Latest tick of a second", unit: "µs", curves: [["latest", "central"]] }],
     };
     this.all = kinds[this.what.value]().map((of) => new Lane(of, this));
@@ -120,8 +123,11 @@ export class Plots {
     this.loads.add(this.now, said.buses.map(({ load }) => (load ?? NaN) * 100));
     const second = said.bench?.lateness.second;
     this.lateness.add(this.now, second ? [second.max, second.p99] : [NaN, NaN]);
-    const late = this.options.find(({ value }) => value === "lateness");
-    late.disabled = !second && !this.playback;
+    this.replies.add(this.now, said.buses.map(({ timed }) => timed?.last_reply_ms ?? NaN));
+    const bounds = said.buses.map(({ timed }) => timed?.bound_ms), are = String(bounds) !== String(this.bounds);
+    this.bounds = bounds;
+    if (are && this.what.value === "replies") this.lanes();
+    for (const [value, is] of [["lateness", second || this.playback], ["replies", said.buses.some(({ timed }) => timed)]]) this.options.find((it) => it.value === value).disabled = !is;
     const jointsOf = (is) => said.buses.flatMap(({ up }, bus) => (up === is ? this.scene.chains[this.scene.buses[bus].chain].rows.map(({ joint }) => joint) : []));
     const up = new Set(jointsOf(true));
     this.down = new Set(jointsOf(false).filter((joint) => !up.has(joint)));
@@ -175,6 +181,10 @@ export class Plots {
   // The points of a curve of a lane; a recording's come from the server, as far as it has read.
   points(lane, curve, { from, to }, count) {
     const what = this.what.value, { playback } = this;
+    if (what === "replies" && curve === 0) {
+      const bound = this.bounds[lane.bus] ?? null;
+      return bound === null ? [] : [from, bound, bound, to, bound, bound];
+    }
     const read = playback ? playback.from_s + playback.read * (playback.of_s - playback.from_s) : -Infinity;
     if (playback && (playback.read >= 1 || this.now < read)) {
       const cell = what === "force" && this.chosen >= 0 ? this.scene.cells[this.chosen] : null;
@@ -193,6 +203,7 @@ export class Plots {
       return cells.map((v, k) => (k % 3 ? v - central[k] : v));
     }
     if (what === "force") return this.chosen < 0 ? [] : this.forces.curve(this.chosen, from, to, count, NO_FORCE);
+    if (what === "replies") return this.replies.curve(lane.bus, from, to, count);
     return what === "load" ? this.loads.curve(lane.bus, from, to, count) : this.lateness.curve(0, from, to, count);
   }
 

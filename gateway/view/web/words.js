@@ -32,6 +32,20 @@ function noted(health, names, text) {
 
 const percent = (share) => (share === null || share === undefined ? "–" : `${(share * 100).toFixed(share < 0.1 ? 1 : 0)} %`);
 
+const ms = (value) => (value === null ? "–" : value.toFixed(value < 10 ? 2 : 1));
+
+// The rows of a bus on which frames take time: its slowest reply beside the bound of `skinbus fit`, and its transmit queues.
+function timed({ timed }) {
+  if (!timed) return [];
+  const rows = [], { queues } = timed;
+  rows.push(["Slowest reply, ms", `${ms(timed.last_reply_ms)}, ${timed.bound_ms === null ? "no bound" : `bound ${ms(timed.bound_ms)}`}`]);
+  if (queues) {
+    rows.push(["Wait: p50, p99, ms", [queues.wait_us.p50, queues.wait_us.p99].map((us) => ms(us / 1000)).join(", ")]);
+    rows.push(["Waiting now, refused", `${queues.waiting}, ${queues.refused}`, queues.refused ? "bad" : ""]);
+  }
+  return rows;
+}
+
 // One row for each bus.
 function many(buses, health) {
   const it = element("table"), head = element("tr");
@@ -68,7 +82,8 @@ export function say(scene, said, ask, health) {
   show($("buses"), said.buses.length > FEW_BUSES ? [many(said.buses, health)] : said.buses.flatMap((bus, b) => [
     element("h3", bus.up ? bus.name : `${bus.name}: down`, bus.up ? "" : "bad"),
     table([
-      ["Load on a real bus", percent(bus.load), bus.load > 1 ? "bad" : ""],
+      [bus.timed ? `Load at ${bus.timed.rates ?? "unknown rates"}` : "Load on a real bus", percent(bus.load), bus.load > 1 ? "bad" : ""],
+      ...timed(bus),
       ["Replies in time", `${bus.in_time} of ${bus.due}`],
       ["Replies late, missing", ...noted(health, [`${b} late`, `${b} missing`], `${bus.late}, ${bus.missing}`)],
       ["Packets lost, damaged", ...noted(health, [`${b} lost`, `${b} rejected`], `${bus.lost}, ${bus.rejected}`)],

@@ -19,9 +19,11 @@ pub use directory::{
     DirectoryError, MARKER_FILE, default_directory, make_directory, open_directory, remove_directory,
     socket_address, socket_name, write_marker,
 };
+pub use figures::{FIGURES_REQUEST, FiguresRequest, MAX_FIGURES_BYTES};
 
 mod client;
 mod directory;
+mod figures;
 
 /// The newest version of the protocol between client and server, which every hello contains.
 pub const HELLO_VERSION: u8 = 3;

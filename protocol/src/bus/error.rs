@@ -129,10 +129,10 @@ pub enum BusError {
          raise `ulimit -Hn` where the server is started"
     )]
     NoRoom(String),
-    /// Frames take time on the embedded bus, which this client cannot follow.
+    /// Frames take time on the embedded bus, which this client does not support.
     #[error(
-        "frames take time on the embedded bus {0}, which serial lines and other hosts cannot follow: serve it without \
-         --rates, or end the run with --bus-time real"
+        "frames take time on the embedded bus {0}, which serial lines, other hosts and conformance tests do not \
+         support: serve it without --rates, or end the run with --bus-time real"
     )]
     TakesTime(String),
     /// The server of the embedded bus has ended. The bus must be opened again.

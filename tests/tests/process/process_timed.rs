@@ -2,15 +2,18 @@
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use std::collections::BTreeSet;
+use std::time::Duration;
 
 use bus_model::TransmitQueue;
-use protocol::bus::embedded::{ClientHello, HelloReply, seqpacket_socket, socket_address};
+use protocol::bus::embedded::{ClientHello, FiguresRequest, HelloReply, seqpacket_socket, socket_address};
 use protocol::bus::{Bus, BusKind, BusOptions, Filter, Inbox, KindChoice};
 use protocol::can::{BIT_RATE_SWITCH, Frame};
 use protocol::wire_time::{BitRates, FrameBits};
 use rustix::net::{RecvFlags, SendFlags, SocketFlags};
 use rustix::process::Signal;
+use serde_json::Value;
 use skinbus_tests::bus_time::check_record;
+use skinbus_tests::process::page::{Page, address, watched_skin};
 use skinbus_tests::process::{PRESSED, Running, TestDir, skin, until};
 use trace::capture::{CaptureEntry, Reader};
 
@@ -139,16 +142,60 @@ fn a_second_program_computes_the_times_of_a_live_bus_again() {
     }
 }
 
+/// A skin of six cells on a bus on which frames take time.
+fn timed_skin() -> String {
+    skin(6).replace(
+        "format = \"fd\"",
+        "format = \"fd\"\nbitrate = 1000000\ndata_bitrate = 5000000\ntime = \"real\"",
+    )
+}
+
+#[test]
+fn a_page_shows_the_slowest_reply_beside_its_bound_and_who_waits() {
+    let place = TestDir::new();
+    // A busy machine must not halt the robot.
+    place.write("skin.toml", &(timed_skin() + "\n[safety]\nbad_cycles = 10000\n"));
+    let fit = place.start("skinbus", "fit skin.toml --json").end().succeeded();
+    let fit: Value = serde_json::from_str(&fit.stdout).unwrap();
+    let bound_ms = fit["buses"][0]["last_answer_us"].as_f64().unwrap() / 1e3;
+    let (run, address_of_run) = watched_skin(&place, "--record run.mcap");
+    let mut page = Page::new(&address_of_run);
+    page.wait_for_snapshot("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    page.press(3, 5.0);
+    let is_slow = |said: &Value| said["buses"][0]["timed"]["last_reply_ms"].as_f64() > Some(0.0);
+    let said = page.wait_for_status("a reply, and frames that have waited", |said| {
+        is_slow(said) && said["buses"][0]["timed"]["queues"]["wait_us"]["count"].as_u64() > Some(0)
+    });
+    let timed = &said["buses"][0]["timed"];
+    assert_eq!(timed["rates"], "1M/5M");
+    assert!((timed["bound_ms"].as_f64().unwrap() - bound_ms).abs() < 1e-3, "{timed} {bound_ms}");
+    run.signal(Signal::INT);
+    run.end();
+    place.summary().adds_up();
+    // The recording knows that its stamps are ends of frames.
+    let view = place.start("skinbus", "view run.mcap");
+    let mut page = Page::new(&address(&view));
+    page.send(r#"{"do":"play"}"#);
+    page.wait_for_status("a slowest reply", is_slow);
+    view.signal(Signal::INT);
+    view.end();
+    place.is_left_clean();
+    // On a bus without time there is none.
+    let place = TestDir::new();
+    place.write("skin.toml", &timed_skin());
+    let (run, address_of_run) = watched_skin(&place, "--bus-time none");
+    let mut page = Page::new(&address_of_run);
+    let said = page.wait_for_status("a state", |said| said["bench"]["buses"][0].is_object());
+    assert!(said["buses"][0]["timed"].is_null(), "{said}");
+    run.signal(Signal::INT);
+    run.end();
+    place.is_left_clean();
+}
+
 #[test]
 fn a_run_on_a_timed_bus_accounts_for_each_reply() {
     let place = TestDir::new();
-    place.write(
-        "skin.toml",
-        &skin(6).replace(
-            "format = \"fd\"",
-            "format = \"fd\"\nbitrate = 1000000\ndata_bitrate = 5000000\ntime = \"real\"",
-        ),
-    );
+    place.write("skin.toml", &timed_skin());
     place.scenario(PRESSED);
     place.bench(2.0, "--record run.mcap").end().succeeded();
     let summary = place.summary();
@@ -192,14 +239,30 @@ fn on_a_full_bus_nothing_is_missing_without_a_reason() {
             + "\n[safety]\nbad_cycles = 10000\n"),
     );
     place.scenario(&PRESSED.replace("[3]", "[1, 2, 3, 4, 5, 6]"));
-    let ended = place.bench(6.0, "--bus-time real:priority:4").end();
-    let summary = place.summary();
-    summary.adds_up();
-    let timed = &summary.0["buses"][0]["timed"];
-    assert!(timed["load"].as_f64() > Some(0.9), "{timed}\n{}", ended.stderr);
-    assert!(timed["refused"].as_u64() > Some(0), "{timed}");
-    let replies = &summary.0["buses"][0]["replies"];
-    assert!(replies["in_time"].as_u64() < replies["due"].as_u64(), "{replies}");
+    let check = |options: &str| {
+        let ended = place.bench(6.0, options).end();
+        let summary = place.summary();
+        summary.adds_up();
+        let bus = &summary.0["buses"][0];
+        let timed = &bus["timed"];
+        assert!(timed["load"].as_f64() > Some(0.9), "{timed}\n{}", ended.stderr);
+        assert!(timed["refused"].as_u64() > Some(0), "{timed}");
+        assert!(bus["replies"]["in_time"].as_u64() < bus["replies"]["due"].as_u64(), "{bus}");
+        for account in ["uplink", "replies"] {
+            assert_eq!(bus[account]["unknown"], 0, "{bus}");
+        }
+        assert_eq!(bus["uplink"]["restarts"], 0, "{bus}");
+        timed["requested"].as_u64().unwrap()
+    };
+    let own = check("--bus-time real:priority:4");
+    // The same on a bus that another program serves, and again there: each run counts for itself.
+    let server = serve(&place, "--rates 50k --queue priority:4");
+    for _ in 0..2 {
+        let requested = check("--overwrite");
+        assert!((own / 2..own * 3 / 2).contains(&requested), "{requested} of {own}");
+    }
+    server.signal(Signal::TERM);
+    server.end().succeeded();
     place.is_left_clean();
 }
 
@@ -224,6 +287,8 @@ fn what_cannot_take_time_is_refused() {
     assert_eq!(place.read("record.txt"), "mine");
 
     let server = serve(&place, "");
+    let figures = FiguresRequest::send("vcan0", Some(&place.buses())).unwrap();
+    assert_eq!(figures.receive(Duration::from_secs(60)), Some(Vec::new()), "frames take no time");
     let ended = place.bench(1.0, "--bus-time real").end();
     let why = "vcan0 is served by another program without bit rates: end it, or start it as `vcan-setup serve vcan0 \
                --rates 1M/5M`, or add --bus-time none";
@@ -234,6 +299,11 @@ fn what_cannot_take_time_is_refused() {
     let server = serve(&place, "--rates 1M/5M");
     let ended = place.start("vcan-setup", "slcan vcan0 /dev/null --bus-kind embedded").end();
     assert!(ended.stderr.contains("frames take time on the embedded bus vcan0"), "{}", ended.stderr);
+    let ended = place.start("skinbus", "conformance --bus vcan0 --cell 1").end();
+    assert!(
+        ended.refusal(2).contains("conformance tests do not support: serve it without --rates"),
+        "{ended:#?}"
+    );
     server.signal(Signal::TERM);
     server.end().succeeded();
     place.write("skin.toml", &skin(2).replace("format = \"fd\"", "format = \"fd\"\ntime = \"real\""));

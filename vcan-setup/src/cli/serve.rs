@@ -1,7 +1,6 @@
 //! The command `vcan-setup serve`.
 
-use std::io::{BufRead, Write};
-use std::os::fd::OwnedFd;
+use std::io::Write;
 use std::os::unix::net::UnixStream;
 use std::path::PathBuf;
 
@@ -12,7 +11,7 @@ use protocol::usage::Failure;
 use protocol::wire_time::BitRates;
 use rustix::process::{Resource, Rlimit, Signal, getrlimit, setrlimit};
 use signal_hook::consts::{SIGINT, SIGTERM};
-use vcan_setup::embedded::{BusRecord, BusTotals, Server, TimedBusOptions, TimedReport};
+use vcan_setup::embedded::{BusRecord, BusTotals, Server, TimedBusOptions};
 
 use super::parse_bus_name;
 
@@ -31,8 +30,7 @@ pub(crate) struct ServeBusOptions {
     /// Name of the bus, at most 15 bytes, as for a network interface
     #[arg(value_parser = parse_bus_name)]
     name: String,
-    /// Also stop when standard input ends or the parent process dies. Each line "report" on standard input prints the
-    /// figures of a timed bus to standard output, as one JSON object
+    /// Also stop when standard input ends or the parent process dies
     #[arg(long)]
     until_eof: bool,
     /// Let frames take time, as on a real bus with these bit rates: 1M/5M, or 500k for classic CAN. Frames are
@@ -92,7 +90,6 @@ fn format_with_causes(error: &anyhow::Error) -> String {
 fn serve(options: &ServeBusOptions) -> anyhow::Result<()> {
     let ServeBusOptions { name, until_eof, .. } = options;
     let timed = options.timed_bus()?;
-    let (ask, asked) = UnixStream::pair().context("cannot create the socket pair that requests reports")?;
     let (stop, stopped) =
         UnixStream::pair().context("cannot create the socket pair that stops the server")?;
     for signal in [SIGINT, SIGTERM] {
@@ -105,10 +102,7 @@ fn serve(options: &ServeBusOptions) -> anyhow::Result<()> {
         rustix::process::set_parent_process_death_signal(Some(Signal::TERM))
             .context("cannot watch the parent process")?;
         let follow = move || {
-            let lines = std::io::stdin().lock().split(b'\n').map_while(Result::ok);
-            for _ in lines.filter(|line| line.trim_ascii() == b"report") {
-                let _ = (&ask).write_all(b"r");
-            }
+            let _ = std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
             let _ = (&stop).write_all(b"end");
         };
         std::thread::Builder::new()
@@ -130,7 +124,7 @@ fn serve(options: &ServeBusOptions) -> anyhow::Result<()> {
     writeln!(std::io::stdout(), "serving {name} at {}", server.path().display())
         .and_then(|()| std::io::stdout().flush())
         .context("cannot write to standard output")?;
-    let totals = server.run_with_reports(stopped, &OwnedFd::from(asked), print_report)?;
+    let totals = server.run(stopped)?;
     let BusTotals { garbage, refused, turned_away, failed, failure, .. } = totals;
     // Only the server can report these frames, because a client gets no error for an invalid datagram.
     if garbage > 0 || refused > 0 {
@@ -160,13 +154,6 @@ fn raise_file_limit() {
     let Rlimit { maximum, .. } = getrlimit(Resource::Nofile);
     // With a lower limit the server accepts fewer clients.
     let _ = setrlimit(Resource::Nofile, Rlimit { current: maximum, maximum });
-}
-
-/// Prints the figures of a timed bus as one line. Ignores a failure, because the reader has ended.
-fn print_report(report: &TimedReport) {
-    let text = serde_json::to_string(report).unwrap_or_default();
-    let mut out = std::io::stdout();
-    let _ = writeln!(out, "{text}").and_then(|()| out.flush());
 }
 
 /// Prints a line to standard error. Ignores a failure, because it could not be reported.

@@ -40,8 +40,7 @@ const PAUSE: Duration = Duration::from_millis(1);
 const MAX_FAILURES: u32 = 1_000;
 const LISTENER: u64 = u64::MAX;
 const STOP: u64 = u64::MAX - 1;
-const REPORT: u64 = u64::MAX - 2;
-const ROUND_END: u64 = u64::MAX - 3;
+const ROUND_END: u64 = u64::MAX - 2;
 
 /// The reason why a bus cannot be served any longer.
 #[derive(Debug, Error)]
@@ -95,9 +94,6 @@ struct TimedRounds {
     wall_offset: i64,
     effects: RoundEffects,
 }
-
-/// A function that takes the figures of a timed bus.
-type ReportSink<'a> = &'a mut dyn FnMut(&TimedReport);
 
 /// A source of datagrams. Tests replace it to simulate errors.
 trait Receive {
@@ -170,37 +166,14 @@ impl Server {
     /// # Errors
     /// Returns [`ServeError`] if a system call fails, which no client can cause.
     pub fn run(self, stop: impl AsFd) -> Result<BusTotals, ServeError> {
-        self.run_with(stop, None, ReceiveBatch::new())
+        self.run_with(stop, ReceiveBatch::new())
     }
 
-    /// Serves the bus as [`Server::run`] does, and calls a function with the figures of a timed bus for each byte that
-    /// can be read from a socket.
-    ///
-    /// # Errors
-    /// Returns [`ServeError`] as [`Server::run`] does.
-    pub fn run_with_reports(
-        self,
-        stop: impl AsFd,
-        requests: &OwnedFd,
-        mut report: impl FnMut(&TimedReport),
-    ) -> Result<BusTotals, ServeError> {
-        self.run_with(stop, Some((requests, &mut report)), ReceiveBatch::new())
-    }
-
-    fn run_with(
-        mut self,
-        stop: impl AsFd,
-        mut reports: Option<(&OwnedFd, ReportSink<'_>)>,
-        mut batch: impl Receive,
-    ) -> Result<BusTotals, ServeError> {
+    fn run_with(mut self, stop: impl AsFd, mut batch: impl Receive) -> Result<BusTotals, ServeError> {
         let name = self.name.clone();
         let failed = |doing, errno: Errno| ServeError::Io { name: name.clone(), doing, source: errno.into() };
         epoll::add(&self.post.epoll, &stop, EventData::new_u64(STOP), EventFlags::IN)
             .map_err(|errno| failed("watch for the stop request", errno))?;
-        if let Some((requests, _)) = &reports {
-            epoll::add(&self.post.epoll, requests, EventData::new_u64(REPORT), EventFlags::IN)
-                .map_err(|errno| failed("watch for requests of reports", errno))?;
-        }
         self.create_round_timer().map_err(|errno| failed("create the timer of the bus", errno))?;
         let mut events = Vec::with_capacity(256);
         loop {
@@ -217,7 +190,6 @@ impl Server {
             for &epoll::Event { flags, data } in &events {
                 match data.u64() {
                     STOP => return Ok(self.end()),
-                    REPORT => self.answer_report_requests(&mut reports),
                     LISTENER => self.accept_clients(),
                     ROUND_END => {}
                     token => {

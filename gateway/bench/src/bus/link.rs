@@ -10,8 +10,10 @@ use std::time::{Duration, Instant};
 
 use protocol::bus::{Bus, BusError, BusKind, BusOptions, KindChoice, SendError};
 use protocol::can::Frame;
+use vcan_setup::embedded::TimedReport;
 use vcan_setup::hosts::report::ReportReader;
 
+use super::figures::TimedFigures;
 use super::follow::BusSource;
 use control::cycle::turn::BusState;
 
@@ -78,6 +80,13 @@ impl SharedBus {
     /// Returns [`io::Error`] if no such process runs.
     pub fn connect_reports(&self) -> io::Result<ReportReader> {
         ReportReader::connect(&self.name, self.kind, self.target.directory.as_deref())
+    }
+
+    /// Returns the figures of a timed bus from its server; `None` if the server does not answer.
+    #[must_use]
+    pub fn request_figures(&self) -> Option<TimedReport> {
+        let served = self.kind.served_name(&self.name);
+        TimedFigures::new(&served, self.target.directory.as_deref()).request()
     }
 
     /// Sends frames. Blocks while the receiver replaces the bus, so the control loop must not call it.

@@ -1,14 +1,11 @@
 //! Embedded buses that this gateway serves, each in a process of its own.
 
-use std::io::{BufRead, BufReader, Write};
+use std::io::{BufRead, BufReader};
 use std::path::Path;
-use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
-use std::time::Duration;
+use std::process::{Child, Command, ExitStatus, Stdio};
 
 use protocol::bus::{Bus, BusError, BusOptions, KindChoice};
-use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use thiserror::Error;
-use vcan_setup::embedded::TimedReport;
 
 use super::time::{BusTimeError, ServedTime, check_bus_time};
 use crate::processes::{LaunchError, isolate_process_group, program_path, spawn, wait_or_kill};
@@ -18,14 +15,7 @@ use crate::processes::{LaunchError, isolate_process_group, program_path, spawn, 
 pub struct ServedBus {
     bus: String,
     child: Child,
-    /// The lines that the server prints; `None` until it serves.
-    output: Option<BufReader<ChildStdout>>,
-    /// True if frames take time on the bus.
-    is_timed: bool,
 }
-
-/// Time that a server has to report its figures.
-const REPORT_TIMEOUT: Duration = Duration::from_secs(2);
 
 impl ServedBus {
     /// Serves a bus, in `directory` or else in the usual one, and waits until clients can connect.
@@ -58,7 +48,7 @@ impl ServedBus {
         command.stdin(Stdio::piped()).stdout(Stdio::piped());
         isolate_process_group(&mut command, directory);
         let child = spawn(&mut command)?;
-        Ok(Self { bus: bus.to_owned(), child, output: None, is_timed: time.is_some() })
+        Ok(Self { bus: bus.to_owned(), child })
     }
 
     /// Waits until clients can connect.
@@ -66,7 +56,7 @@ impl ServedBus {
         let start = |source| LaunchError::Start { path: program.to_owned(), source };
         let mut line = String::new();
         if let Some(output) = self.child.stdout.take() {
-            self.output.insert(BufReader::new(output)).read_line(&mut line).map_err(start)?;
+            BufReader::new(output).read_line(&mut line).map_err(start)?;
         }
         if line.starts_with("serving ") {
             return Ok(());
@@ -84,22 +74,6 @@ impl ServedBus {
     #[must_use]
     pub fn bus_name(&self) -> &str {
         &self.bus
-    }
-
-    /// Returns the figures of the bus; `None` if frames take no time on it, or if the server does not answer.
-    pub fn report(&mut self) -> Option<TimedReport> {
-        let Self { child, output, is_timed: true, .. } = self else { return None };
-        let (stdin, output) = (child.stdin.as_mut()?, output.as_mut()?);
-        stdin.write_all(b"report\n").and_then(|()| stdin.flush()).ok()?;
-        let mut polled = [PollFd::new(output.get_ref(), PollFlags::IN)];
-        let wait = Timespec::try_from(REPORT_TIMEOUT).ok()?;
-        if rustix::io::retry_on_intr(|| poll(&mut polled, Some(&wait))).ok()? == 0 {
-            self.is_timed = false;
-            return None;
-        }
-        let mut line = String::new();
-        output.read_line(&mut line).ok()?;
-        serde_json::from_str(&line).ok()
     }
 
     /// Ends the server process. The process removes its socket, and clients find a closed connection.

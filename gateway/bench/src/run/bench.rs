@@ -28,6 +28,7 @@ use crate::processes::Processes;
 use crate::processes::ended::EndedProcesses;
 use crate::record::Recorder;
 use crate::setup::format_cells;
+use crate::summary::TimedReport;
 use crate::view::{BusView, CellView};
 use control::cycle::ControlCycle;
 use control::cycle::turn::{BusPort, SharedRunState, TimedRecord};
@@ -55,6 +56,8 @@ pub(super) struct RunBus {
     /// Network of its cells, if they answer with sums.
     pub(super) network: Option<Network>,
     pub(super) shared: Arc<SharedRunState>,
+    /// Figures of the bus before this run, if frames take time on it.
+    pub(super) figures_before: Option<TimedReport>,
 }
 
 impl RunBus {

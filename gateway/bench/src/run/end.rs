@@ -42,15 +42,17 @@ impl Bench<'_> {
         self.summarise(summary, &measured, &received, timed).with_verdict(failure)
     }
 
-    /// Returns the figures of the timed buses that this run serves, each with the name of the bus.
-    fn timed_reports(&mut self) -> Vec<(String, TimedReport)> {
-        let reports =
-            self.served.iter_mut().map(|served| Some((served.bus_name().to_owned(), served.report()?)));
-        reports.flatten().collect()
+    /// Returns the figures of the timed buses since the start of this run, each with the name of the bus.
+    fn timed_reports(&self) -> Vec<(String, TimedReport)> {
+        let since_start = |bus_link: &RunBus| {
+            let report = bus_link.link.request_figures()?;
+            Some((bus_link.link.name.clone(), report.since(bus_link.figures_before.as_ref()?)))
+        };
+        self.bus_links.iter().filter_map(since_start).collect()
     }
 
     /// Waits until the transmit queues of timed buses are empty, so that what they still hold is not missing.
-    fn wait_for_transmit_queues(&mut self) {
+    fn wait_for_transmit_queues(&self) {
         let give_up = Instant::now() + FINAL_REPORT_TIMEOUT;
         let is_waiting = |(_, report): &(String, TimedReport)| report.waiting > 0;
         while self.timed_reports().iter().any(is_waiting) && Instant::now() < give_up {
@@ -82,7 +84,7 @@ impl Bench<'_> {
     }
 
     /// Waits for late replies, and requests the counters and a last heartbeat of all cells.
-    pub(super) fn request_final_reports(&mut self, interrupted: bool) -> Result<(), RunError> {
+    pub(super) fn request_final_reports(&self, interrupted: bool) -> Result<(), RunError> {
         let two_periods = Duration::try_from_secs_f64(2.0 / self.options.skin.timing.broadcast_hz());
         thread::sleep(two_periods.unwrap_or_default());
         self.wait_for_transmit_queues();

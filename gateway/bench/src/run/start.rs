@@ -341,6 +341,7 @@ fn start_receiver(
     let receiver = Some(spawn(&format!("rx {}", link.name), move || receiver.run())?);
     let network = Network::for_bus(skin, index);
     let line = Some((line, slot));
+    let figures_before = if link.is_timed { link.request_figures() } else { None };
     Ok(RunBus {
         link,
         format,
@@ -351,5 +352,6 @@ fn start_receiver(
         hosts: OtherHosts::new(),
         network,
         shared,
+        figures_before,
     })
 }

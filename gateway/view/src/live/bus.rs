@@ -1,6 +1,8 @@
 //! The state of one bus: the state of its cells, and the torques of the last epoch.
 
+use analysis::fit;
 use analysis::fit::rates::RequestedRates;
+use bench::summary::TimedReport;
 use bench::view::CellView;
 use model::central::CentralComputation;
 use model::table::{BusTable, CellState, CellStatus, Notice};
@@ -16,6 +18,7 @@ use protocol::time::Micros;
 use protocol::wire_time::{BitRates, FrameBits};
 
 use super::flag;
+use super::replies::ReplyTimes;
 
 /// The time over which the load of the bus is averaged, in µs.
 const LOAD_WINDOW_US: u64 = 1_000_000;
@@ -55,6 +58,12 @@ pub(crate) struct LiveBus {
     pub(crate) dead_since: Vec<Option<Micros>>,
     rates: Option<BitRates>,
     load: BusLoad,
+    /// The times of replies; `None` on a bus on which frames take no time.
+    replies: Option<Box<ReplyTimes>>,
+    /// The longest time in ns from joints to their last reply in the worst case, if it has a bound.
+    last_reply_bound_ns: Option<u64>,
+    /// The figures of the bus's server, if frames take time on the bus.
+    figures: Option<TimedReport>,
     pub(crate) halted: bool,
     pub(crate) is_up: bool,
     pub(crate) dropped: u64,
@@ -66,6 +75,7 @@ impl LiveBus {
         table.set_torque_comparison(true);
         let described = skin.buses.get(bus);
         let cells = table.cells().len();
+        let rates = described.and_then(|bus| Some(RequestedRates::default().for_bus(bus).ok()?.rates));
         Self {
             name: described.map(|bus| bus.name.clone()).unwrap_or_default(),
             central: CentralComputation::new(&skin.with_cells_of_bus(bus)),
@@ -77,8 +87,11 @@ impl LiveBus {
             joints: skin.joints_on_bus(bus).len(),
             last: vec![None; cells],
             dead_since: vec![None; cells],
-            rates: described.and_then(|bus| Some(RequestedRates::default().for_bus(bus).ok()?.rates)),
+            rates,
             load: BusLoad::default(),
+            replies: None,
+            figures: None,
+            last_reply_bound_ns: rates.and_then(|rates| fit::last_reply_bound_ns(skin, bus, rates)),
             halted: false,
             is_up: false,
             dropped: 0,
@@ -103,12 +116,17 @@ impl LiveBus {
                 self.close_epoch();
                 let heard = BroadcastJoints { epoch, positions: said.positions };
                 self.previous = self.current.replace(heard);
+                self.replies.iter_mut().for_each(|replies| replies.handle_joints(at, epoch));
             }
             Some(Message::Torque { from, epoch, torque }) => {
                 let place = self.table.index_of(from);
                 if let Some(last) = place.and_then(|place| self.last.get_mut(place)) {
                     *last = Some((at, epoch, torque));
                 }
+                self.replies.iter_mut().for_each(|replies| replies.handle_reply(at, epoch));
+            }
+            Some(Message::Sum { epoch, .. }) => {
+                self.replies.iter_mut().for_each(|replies| replies.handle_reply(at, epoch));
             }
             Some(Message::Halt) => self.halted = true,
             Some(Message::Resume) => self.halted = false,
@@ -146,6 +164,7 @@ impl LiveBus {
     /// Sets the time, by which cells become silent and the load is measured. Returns the notices since the last call.
     pub(crate) fn handle_time(&mut self, now: Micros) -> Vec<Notice> {
         self.table.handle_time(now);
+        self.replies.iter_mut().for_each(|replies| replies.handle_time(now));
         let notices = self.table.drain_notices().collect();
         for ((_, status), since) in self.table.statuses(now).zip(&mut self.dead_since) {
             match status {
@@ -167,6 +186,41 @@ impl LiveBus {
 
     pub(crate) const fn set_state(&mut self, is_up: bool, dropped: u64) {
         (self.is_up, self.dropped) = (is_up, dropped);
+    }
+
+    /// Sets whether frames take time on the bus, so that their time stamps are their ends.
+    pub(crate) fn set_timed(&mut self, is_timed: bool) {
+        if is_timed != self.replies.is_some() {
+            self.replies = is_timed.then(Box::default);
+            self.figures = None;
+        }
+    }
+
+    /// Sets the figures of the server of a timed bus. Load and upper bound follow its bit rates.
+    pub(crate) fn set_figures(&mut self, skin: &Skin, bus: usize, figures: TimedReport) {
+        let rates = figures.rates.parse().ok();
+        if rates.is_some() && rates != self.rates {
+            self.rates = rates;
+            self.last_reply_bound_ns = rates.and_then(|rates| fit::last_reply_bound_ns(skin, bus, rates));
+        }
+        self.figures = Some(figures);
+    }
+
+    pub(super) const fn figures(&self) -> Option<&TimedReport> {
+        self.figures.as_ref()
+    }
+
+    /// Returns the times of replies; `None` on a bus on which frames take no time.
+    pub(crate) fn reply_times(&self) -> Option<&ReplyTimes> {
+        self.replies.as_deref()
+    }
+
+    pub(super) const fn rates(&self) -> Option<BitRates> {
+        self.rates
+    }
+
+    pub(super) const fn last_reply_bound_ns(&self) -> Option<u64> {
+        self.last_reply_bound_ns
     }
 
     pub(crate) const fn bus_load(&self) -> Option<f64> {

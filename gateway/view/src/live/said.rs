@@ -6,11 +6,13 @@ use protocol::fixed::is_saturated;
 use protocol::id::{Id, Kind};
 use protocol::message::{SensorPage, SensorReadings};
 use protocol::parameters::Contact;
+use protocol::quantiles::Quantiles;
 use protocol::schema::{FieldFormat, PacketSchema};
 use protocol::time::Micros;
 use serde::Serialize;
 
 use super::bus::LiveBus;
+use super::replies::ReplyTimes;
 use super::{DecodedFrame, LiveState, TorqueExplanation};
 use crate::page_command::SelectedCell;
 use crate::player::PlayerStatus;
@@ -84,9 +86,35 @@ pub struct BusStatus {
     pub dropped: u64,
     /// The mean absolute difference between the torques of single cells and those of the central computation, in Nm.
     pub error_nm: Option<f64>,
+    /// The times on a bus on which frames take time; null on another one.
+    pub timed: Option<TimedBusStatus>,
     /// For a bus whose cells send sums: the wires of each cell in the tree, in the skin's order. It is null for a cell
     /// that has not reported them or is dead.
     pub tree: Option<Vec<Option<CellParentAndWires>>>,
+}
+
+/// The replies and the transmit queues of a timed bus.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct TimedBusStatus {
+    /// The bit rates for which load and upper bound hold, such as `1M/5M`; null if they are unknown.
+    pub rates: Option<String>,
+    /// The longest time from joints to a reply to them in the last second, in ms; null without a reply.
+    pub last_reply_ms: Option<f64>,
+    /// The upper bound of `skinbus fit` for this time, in ms; null if there is none.
+    pub bound_ms: Option<f64>,
+    /// The transmit queues, as the bus's server reports them; null in a recording.
+    pub queues: Option<TransmitQueues>,
+}
+
+/// The transmit queues of a timed bus, up to a second ago.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct TransmitQueues {
+    /// The number of frames that wait to be sent.
+    pub waiting: u64,
+    /// The time from a request to the end of the frame, since the bus is served.
+    pub wait_us: Quantiles,
+    /// The number of frames that a full queue refused.
+    pub refused: u64,
 }
 
 /// A cell's parent and wires in the tree, as the cell reports them.
@@ -294,6 +322,20 @@ impl LiveState {
 }
 
 impl LiveBus {
+    fn timed_bus_status(&self, replies: &ReplyTimes) -> TimedBusStatus {
+        TimedBusStatus {
+            rates: self.rates().map(|rates| rates.to_string()),
+            last_reply_ms: replies.longest_of_second_ms(),
+            #[expect(clippy::cast_precision_loss, reason = "2^53 ns are 104 days")]
+            bound_ms: self.last_reply_bound_ns().map(|nanos| nanos as f64 * 1e-6),
+            queues: self.figures().map(|figures| TransmitQueues {
+                waiting: figures.waiting,
+                wait_us: figures.wait_us,
+                refused: figures.refused,
+            }),
+        }
+    }
+
     fn bus_status(&self, now: Micros) -> BusStatus {
         let counters = self.table.counters();
         let uplink = self.table.uplink();
@@ -315,6 +357,7 @@ impl LiveBus {
             saturated: counters.event_count(FrameEvent::Saturated),
             dropped: self.dropped,
             error_nm: errors.mean(),
+            timed: self.reply_times().map(|replies| self.timed_bus_status(replies)),
             tree: self.sums.then(|| {
                 let cells = self.table.statuses(now).map(|(cell, status)| {
                     let sends = !matches!(status, CellStatus::Dead | CellStatus::Unknown);

@@ -132,7 +132,7 @@ fn is_kept_open(socket: &OwnedFd) -> bool {
 }
 
 /// Connects to a server. The connection may still wait to be accepted by the server, so a timeout limits sending on it.
-fn connect(name: &str, directory: Option<&Path>) -> Result<OwnedFd, BusError> {
+pub(super) fn connect(name: &str, directory: Option<&Path>) -> Result<OwnedFd, BusError> {
     let directory = directory.map_or_else(default_directory, Path::to_owned);
     let failed = |errno: Errno| BusError::open_error(name, "connect to", errno);
     let not_served = || BusError::NotServed { name: name.to_owned(), directory: directory.clone() };

@@ -5,7 +5,9 @@ use std::os::fd::OwnedFd;
 use std::time::Duration;
 
 use protocol::bus::batch::{is_memory_shortage, send_one};
-use protocol::bus::embedded::{ClientHello, HelloReply, MAX_HELLO_BYTES, enable_time_stamps};
+use protocol::bus::embedded::{
+    ClientHello, FIGURES_REQUEST, HelloReply, MAX_HELLO_BYTES, enable_time_stamps,
+};
 use rustix::event::epoll::{self, EventData, EventFlags};
 use rustix::io::Errno;
 use rustix::net::{RecvFlags, Shutdown, SocketFlags, shutdown, sockopt};
@@ -106,6 +108,10 @@ impl Server {
             Err(Errno::AGAIN | Errno::INTR) => return,
             Err(errno @ (Errno::NOMEM | Errno::NOBUFS)) => return self.handle_failure(id, errno),
             Ok((0, _)) | Err(_) => return self.remove_client(id),
+            Ok((len, _)) if bytes.get(..len) == Some(&FIGURES_REQUEST) => {
+                self.answer_figures_request(id);
+                return self.remove_client(id);
+            }
             Ok((len, _)) => {
                 let bytes = bytes.get(..len).unwrap_or_default();
                 (ClientHello::decode(bytes), ClientHello::refused_version(bytes))

@@ -42,7 +42,7 @@ impl TestServer {
         let server = Server::bind_in(&directory.path().join("skinbus"), "vcan0").unwrap();
         let faulty = Faulty { batch: ReceiveBatch::new(), errors: errors.iter().copied().collect(), last };
         let (stop, stopped) = UnixStream::pair().unwrap();
-        let thread = std::thread::spawn(move || server.run_with(stopped, None, faulty));
+        let thread = std::thread::spawn(move || server.run_with(stopped, faulty));
         Self { directory, stop, thread }
     }
 

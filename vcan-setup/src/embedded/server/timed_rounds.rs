@@ -1,18 +1,16 @@
 //! The rounds of a timed bus: in each, the server reads all requests, advances the bus to the present, and sends the
 //! frames that have ended.
 
-use std::os::fd::OwnedFd;
 use std::time::Duration;
 
-use protocol::bus::batch::Datagram;
+use protocol::bus::batch::{Datagram, send_one};
 use rustix::event::epoll::{self, EventData, EventFlags};
 use rustix::io::Errno;
-use rustix::net::RecvFlags;
 use rustix::time::{
     Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, Timespec, timerfd_create, timerfd_settime,
 };
 
-use super::{ROUND_END, ReportSink, Server, TimedRounds};
+use super::{ROUND_END, Server, TimedRounds};
 use crate::embedded::parcel::FrameDatagram;
 use crate::embedded::routing::ClientId;
 use crate::embedded::timed::{BusClock, RoundEffects, TimedBus, TimedBusOptions};
@@ -99,21 +97,12 @@ impl Server {
         }
     }
 
-    /// Reports the figures of a timed bus once for each byte that has arrived.
-    pub(super) fn answer_report_requests(&mut self, reports: &mut Option<(&OwnedFd, ReportSink<'_>)>) {
-        let Some((requests, report)) = reports else { return };
-        let mut bytes = [0; 16];
-        match rustix::net::recv(*requests, &mut bytes, RecvFlags::DONTWAIT) {
-            Ok((count @ 1.., _)) => {
-                let figures = self.timed.as_mut().map(|timed| timed.bus.report()).unwrap_or_default();
-                (0..count).for_each(|_| report(&figures));
-            }
-            Ok((0, _)) => {
-                // The other end is closed, which would be reported without end.
-                let _ = epoll::delete(&self.post.epoll, *requests);
-                *reports = None;
-            }
-            Err(_) => {}
+    /// Answers a request for the figures of a timed bus. Answers nothing if frames take no time on the bus.
+    pub(super) fn answer_figures_request(&mut self, id: ClientId) {
+        let figures = self.timed.as_mut().map(|timed| timed.bus.report().to_json());
+        if let (Some(figures), Some(client)) = (figures, self.client(id)) {
+            // A program that does not wait for the answer needs none.
+            let _ = send_one(&client.socket, &figures);
         }
     }
 }

@@ -3,12 +3,16 @@
 use std::collections::BTreeMap;
 
 use bus_model::TransmitQueue;
+use protocol::bus::embedded::MAX_FIGURES_BYTES;
 use protocol::quantiles::{Quantiles, TimeHistogram};
 use protocol::wire_time::BitRates;
 use serde::{Deserialize, Serialize};
 
 /// Delay of a delivery after the end of its frame from which the server counts as behind, in ns.
 const BEHIND_NS: u64 = 1_000_000;
+
+/// Time in ns after which joints begin another run.
+const MAX_JOINTS_GAP_NS: u64 = 1_000_000_000;
 
 /// The figures of a timed bus since its start.
 #[derive(Clone, Debug, Default, Deserialize, PartialEq, Serialize)]
@@ -38,7 +42,7 @@ pub struct TimedReport {
     /// Time in s for which the bus was busy.
     pub busy_s: f64,
     /// Share of the time between the ends of the first and the last joints for which the bus was busy; `None` before the
-    /// second joints.
+    /// second joints. Joints after a second without any are first ones.
     pub load: Option<f64>,
     /// Time from a request to the end of the frame.
     pub wait_us: Quantiles,
@@ -52,6 +56,56 @@ pub struct TimedReport {
     pub waiting_by_id: BTreeMap<String, u64>,
     /// The reason why the record is incomplete.
     pub record_failure: Option<String>,
+}
+
+impl TimedReport {
+    /// Returns the report as JSON. Leaves out the identifiers if they would not fit into a datagram.
+    #[must_use]
+    pub fn to_json(&self) -> Vec<u8> {
+        let bytes = serde_json::to_vec(self).unwrap_or_default();
+        if bytes.len() <= MAX_FIGURES_BYTES {
+            return bytes;
+        }
+        let (refused_by_id, waiting_by_id) = <_>::default();
+        serde_json::to_vec(&Self { refused_by_id, waiting_by_id, ..self.clone() }).unwrap_or_default()
+    }
+
+    /// Returns the report with the counts since an earlier report of the same server. Quantiles and maxima stay those since the
+    /// server's start.
+    #[must_use]
+    pub fn since(mut self, earlier: &Self) -> Self {
+        // Another server has begun to count again.
+        if [(self.requested, earlier.requested), (self.beside, earlier.beside)]
+            .iter()
+            .any(|(now, then)| now < then)
+        {
+            return self;
+        }
+        for (now, then) in [
+            (&mut self.requested, earlier.requested),
+            (&mut self.sent, earlier.sent),
+            (&mut self.damaged, earlier.damaged),
+            (&mut self.refused, earlier.refused),
+            (&mut self.beside, earlier.beside),
+            (&mut self.behind, earlier.behind),
+        ] {
+            *now = now.saturating_sub(then);
+        }
+        self.busy_s = (self.busy_s - earlier.busy_s).max(0.0);
+        for (id, count) in &earlier.refused_by_id {
+            if let Some(now) = self.refused_by_id.get_mut(id) {
+                *now = now.saturating_sub(*count);
+            }
+        }
+        self.refused_by_id.retain(|_, count| *count > 0);
+        self
+    }
+
+    /// Reads a report from JSON; `None` if it is none.
+    #[must_use]
+    pub fn from_json(bytes: &[u8]) -> Option<Self> {
+        serde_json::from_slice(bytes).ok()
+    }
 }
 
 /// The counters of a timed bus.
@@ -79,7 +133,10 @@ impl Counts {
     /// Notes joints that ended on the bus.
     pub(super) fn mark_joints(&mut self, end: u64) {
         let mark = (end, self.busy_ns);
-        let [first, _] = self.joints.unwrap_or([mark, mark]);
+        let first = match self.joints {
+            Some([first, last]) if end - last.0 <= MAX_JOINTS_GAP_NS => first,
+            Some(_) | None => mark,
+        };
         self.joints = Some([first, mark]);
     }
 
@@ -130,4 +187,59 @@ impl Counts {
 #[expect(clippy::cast_precision_loss, reason = "2^53 ns are 104 days")]
 const fn to_f64(nanos: u64) -> f64 {
     nanos as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    #[expect(clippy::float_cmp, reason = "sums of small integers")]
+    fn a_run_on_a_bus_that_others_used_before_counts_from_its_own_start() {
+        let report = |requested, refused: &[(&str, u64)]| TimedReport {
+            requested,
+            refused: refused.iter().map(|(_, count)| count).sum(),
+            refused_by_id: refused.iter().map(|&(id, count)| (id.to_owned(), count)).collect(),
+            busy_s: requested as f64,
+            ..TimedReport::default()
+        };
+        let (before, after) =
+            (report(5, &[("201", 3), ("202", 1)]), report(9, &[("201", 3), ("202", 4), ("203", 1)]));
+        let run = after.clone().since(&before);
+        assert_eq!((run.requested, run.refused, run.busy_s), (4, 4, 4.0));
+        let by_id: Vec<_> = run.refused_by_id.iter().map(|(id, count)| (id.as_str(), *count)).collect();
+        assert_eq!(by_id, [("202", 3), ("203", 1)]);
+        assert_eq!(after.since(&report(10, &[])).requested, 9, "another server counts");
+    }
+
+    #[test]
+    fn the_load_is_that_of_the_last_joints_without_a_gap() {
+        let mut counts = Counts::default();
+        let queue = "fifo:1".parse().unwrap();
+        let load = |counts: &Counts| {
+            counts.report(("1M".parse().unwrap(), queue, 0.0, 1), BTreeMap::new(), 0, None).load
+        };
+        for (end, busy) in [(0, 0), (1_000_000_000, 500_000_000)] {
+            counts.busy_ns = busy;
+            counts.mark_joints(end);
+        }
+        assert_eq!(load(&counts), Some(0.5));
+        // Nobody sends for a minute; then another run begins.
+        counts.mark_joints(61_000_000_000);
+        assert_eq!(load(&counts), None);
+        counts.busy_ns += 250_000_000;
+        counts.mark_joints(62_000_000_000);
+        assert_eq!(load(&counts), Some(0.25));
+    }
+
+    #[test]
+    fn what_does_not_fit_into_a_datagram_goes_without_identifiers() {
+        let refused_by_id = (0..20_000).map(|id| (format!("{id:08X}"), 1)).collect();
+        let report = TimedReport { refused: 20_000, refused_by_id, ..TimedReport::default() };
+        let bytes = report.to_json();
+        assert!(bytes.len() <= MAX_FIGURES_BYTES);
+        let read = TimedReport::from_json(&bytes).unwrap();
+        assert_eq!((read.refused, read.refused_by_id.len()), (20_000, 0));
+        assert_eq!(TimedReport::from_json(b"skinbus"), None);
+    }
 }

@@ -185,10 +185,9 @@ impl PageDraft<'_> {
     fn last_reply_bound(&self, bus_figures: &BusFigures) -> Option<MarkLine> {
         self.bus_shadows.iter().find(|bus| bus.bus == bus_figures.name && bus.is_timed)?;
         let skin = &self.run.skin;
-        let worst =
-            fit::assess_worst_case(skin, skin.bus_index(&bus_figures.name)?, bus_figures.rates.rates)?;
-        let millis = worst.times.last_answer_ns()? as f64 / 1e6;
-        Some(MarkLine::at_y(millis, "worst case of skinbus fit"))
+        let index = skin.bus_index(&bus_figures.name)?;
+        let nanos = fit::last_reply_bound_ns(skin, index, bus_figures.rates.rates)?;
+        Some(MarkLine::at_y(nanos as f64 / 1e6, "worst case of skinbus fit"))
     }
 
     /// Creates the findings on whether real buses can carry the traffic, in this run and in the worst case. They are
