@@ -8,8 +8,8 @@ use std::panic::{self, AssertUnwindSafe};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use analysis::fit::assess_worst_case;
 use analysis::fit::verdict::FitSummary;
+use analysis::fit::{assess_worst_case, last_reply_bound_ns};
 use bench::bus::time::BusTimeChoice;
 use bench::emulate::EmulatedCells;
 use bench::processes::create_memory_file;
@@ -341,6 +341,18 @@ fn announce_bus_time(options: &mut RunOptions) {
     }
 }
 
+/// Adds the upper bounds for the last replies on timed buses, at the bit rates of their servers.
+fn add_reply_bounds(summary: &mut Summary, skin: &Skin) {
+    for bus in &mut summary.buses {
+        let rates = bus.timed.as_ref().and_then(|timed| timed.rates.parse().ok());
+        let nanos = rates.zip(skin.bus_index(&bus.name));
+        let nanos = nanos.and_then(|(rates, index)| last_reply_bound_ns(skin, index, rates));
+        #[expect(clippy::cast_precision_loss, reason = "2^53 ns are 104 days")]
+        let micros = nanos.map(|nanos| nanos as f64 * 1e-3);
+        bus.last_reply_bound_us = micros;
+    }
+}
+
 /// Returns the cells to emulate and their firmware, if any.
 fn emulated(
     firmware: Option<PathBuf>,
@@ -428,7 +440,7 @@ fn run_bench(
     // The summary reports a panic too.
     let ended = panic::catch_unwind(AssertUnwindSafe(|| run::run(options, remotes)));
     drop(page);
-    let (ended, panicked) = match ended {
+    let (mut ended, panicked) = match ended {
         Ok(Ok(ended)) => (ended, None),
         Ok(Err(error)) => {
             let failure = Failure::with_code(error.exit_code(), error);
@@ -438,6 +450,7 @@ fn run_bench(
             (Summary::for_failed_start(&options.skin, "the gateway panicked".to_owned()), Some(panic))
         }
     };
+    add_reply_bounds(&mut ended, &options.skin);
     let unwritten = summary.and_then(|(whole, file)| {
         to_pretty_json(&ended)
             .and_then(|text| output::write_and_finish("--summary", whole, file, &text))

@@ -312,7 +312,7 @@ pub struct BusSummary {
     pub cells: BTreeMap<&'static str, usize>,
     /// Cells that were dead at the end, or from which no packet was received.
     pub silent_cells: Vec<u8>,
-    /// Figures of a timed bus that this run served.
+    /// Figures of a timed bus.
     pub timed: Option<TimedReport>,
     /// Packets from the cells.
     pub uplink: UplinkSummary,
@@ -338,6 +338,8 @@ pub struct BusSummary {
     pub dropped_by_bus: u64,
     /// Time in µs from a broadcast to its last reply in time, by the kernel's time stamps.
     pub last_reply_us: Quantiles,
+    /// Upper bound of `skinbus fit` for this time in µs, on a timed bus; `None` without one.
+    pub last_reply_bound_us: Option<f64>,
     /// Time in µs from a broadcast to each of its replies, including late ones.
     pub reply_us: Quantiles,
     /// Age in µs, at each heartbeat, of joints that were on the bus and that the cell had not received.
@@ -393,6 +395,7 @@ impl BusSummary {
             events: events.filter(|(_, count)| *count > 0).collect(),
             dropped_by_bus: dropped,
             last_reply_us: Quantiles::from_histogram(table.delays().last_reply_delays(), 1.0),
+            last_reply_bound_us: None,
             reply_us: Quantiles::from_histogram(table.delays().reply_delays(), 1.0),
             joints_not_taken_us: Quantiles::from_histogram(table.delays().pending_joints_ages(), 1.0),
         }

@@ -299,7 +299,11 @@ fn add_reply_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) 
     if is_verbose {
         let last = if bus.sums.is_some() { "last sum" } else { "last reply" };
         let name = format!("{last} after broadcast, µs");
-        rows.add_row(name, format_quantiles(&bus.last_reply_us), "by kernel time stamps");
+        rows.add_row(
+            name,
+            format_quantiles(&bus.last_reply_us),
+            last_reply_remark(bus, "by kernel time stamps"),
+        );
         if bus.sums.is_none() {
             rows.add_row(
                 "  each reply after broadcast, µs",
@@ -310,7 +314,20 @@ fn add_reply_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) 
         add_joint_age_row(rows, bus);
     } else if bus.last_reply_us.count > 0 {
         let name = if bus.sums.is_some() { "last sum, µs" } else { "last reply, µs" };
-        rows.add_row(name, format_quantiles(&bus.last_reply_us), "after the joints message");
+        rows.add_row(
+            name,
+            format_quantiles(&bus.last_reply_us),
+            last_reply_remark(bus, "after the joints message"),
+        );
+    }
+}
+
+/// Returns the remark on the time of the last reply: its upper bound on a timed bus, and else this one.
+fn last_reply_remark(bus: &BusSummary, untimed: &str) -> String {
+    match (&bus.timed, bus.last_reply_bound_us) {
+        (None, _) => untimed.to_owned(),
+        (Some(_), Some(bound)) => format!("after the joints message; bound of fit {bound:.0}"),
+        (Some(_), None) => "after the joints message; fit has no bound".to_owned(),
     }
 }
 

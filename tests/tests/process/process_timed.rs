@@ -197,7 +197,7 @@ fn a_run_on_a_timed_bus_accounts_for_each_reply() {
     let place = TestDir::new();
     place.write("skin.toml", &timed_skin());
     place.scenario(PRESSED);
-    place.bench(2.0, "--record run.mcap").end().succeeded();
+    let ended = place.bench(2.0, "--record run.mcap").end().succeeded();
     let summary = place.summary();
     summary.adds_up();
     let timed = &summary.0["buses"][0]["timed"];
@@ -206,6 +206,8 @@ fn a_run_on_a_timed_bus_accounts_for_each_reply() {
         (&"1M/5M".into(), &TransmitQueue::default().to_string().into())
     );
     assert_eq!(timed["sent"], timed["requested"], "{timed}");
+    let bound = &summary.0["buses"][0]["last_reply_bound_us"];
+    assert!(bound.as_f64() > Some(0.0) && ended.stdout.contains("bound of fit"), "{bound} {}", ended.stdout);
     assert_eq!((timed["refused"].as_u64(), timed["waiting"].as_u64()), (Some(0), Some(0)), "{timed}");
     assert!(timed["beside"].as_u64() > Some(0) && timed["load"].as_f64() > Some(0.0), "{timed}");
     // The report says it, and shows the latest reply beside the bound.

@@ -190,6 +190,7 @@ fn every_key_is_documented_with_its_type_and_no_other() {
     let bus = BusSummary::new("vcan0", "embedded", 0, &table, 0, Micros(0));
     let bus = BusSummary {
         hosts: vec![HostSummary { name: "cells".to_owned(), ..HostSummary::default() }],
+        last_reply_bound_us: Some(14_360.0),
         sums: Some(SumsSummary::default()),
         timed: Some(TimedReport {
             load: Some(0.5),

@@ -194,7 +194,6 @@ mod tests {
     use super::*;
 
     #[test]
-    #[expect(clippy::float_cmp, reason = "sums of small integers")]
     fn a_run_on_a_bus_that_others_used_before_counts_from_its_own_start() {
         let report = |requested, refused: &[(&str, u64)]| TimedReport {
             requested,
