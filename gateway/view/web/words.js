@@ -57,7 +57,7 @@ function many(buses, health) {
   it.className = "buses";
   it.append(head, ...buses.map((bus, b) => {
     const row = element("tr"), name = element("th", bus.up ? bus.name : `${bus.name}: down`, bus.up ? "" : "bad");
-    const pairs = [[["late", "missing"], [bus.late, bus.missing]], [["lost", "rejected", "dropped"], [bus.lost + bus.dropped, bus.rejected]]];
+    const pairs = [[["late", "missing"], [bus.late, bus.missing]], [["lost", "rejected"], [bus.lost, bus.rejected]]];
     name.scope = "row";
     row.append(name, element("td", percent(bus.load), bus.load > 1 ? "bad" : ""),
       ...pairs.map(([names, pair]) => element("td", ...noted(health, names.map((name) => `${b} ${name}`), pair.join(", ")))));
@@ -79,7 +79,8 @@ export function say(scene, said, ask, health) {
   document.body.classList.toggle("halted", halted !== "");
   if ($("halted").textContent !== halted) $("halted").textContent = halted;
   $("halted").hidden = !halted;
-  show($("buses"), said.buses.length > FEW_BUSES ? [many(said.buses, health)] : said.buses.flatMap((bus, b) => [
+  const unread = sum((bus) => bus.dropped);
+  show($("buses"), said.buses.length > FEW_BUSES ? [many(said.buses, health), ...(unread ? [element("p", `The page's server did not read ${unread} frames in time; they count as lost here.`, "faint")] : [])] : said.buses.flatMap((bus, b) => [
     element("h3", bus.up ? bus.name : `${bus.name}: down`, bus.up ? "" : "bad"),
     table([
       [bus.timed ? `Load at ${bus.timed.rates ?? "unknown rates"}` : "Load on a real bus", percent(bus.load), bus.load > 1 ? "bad" : ""],
@@ -87,9 +88,9 @@ export function say(scene, said, ask, health) {
       ["Replies in time", `${bus.in_time} of ${bus.due}`],
       ["Replies late, missing", ...noted(health, [`${b} late`, `${b} missing`], `${bus.late}, ${bus.missing}`)],
       ["Packets lost, damaged", ...noted(health, [`${b} lost`, `${b} rejected`], `${bus.lost}, ${bus.rejected}`)],
+      ...(bus.dropped ? [["  of these, missed by the page", ...noted(health, [`${b} dropped`], String(bus.dropped))]] : []),
       ["Saturated torques", ...noted(health, [`${b} saturated`], String(bus.saturated))],
       ["Mean error", bus.error_nm === null ? "–" : `${bus.error_nm.toExponential(1)} Nm`],
-      ...(bus.dropped ? [["Frames not read in time", ...noted(health, [`${b} dropped`], String(bus.dropped))]] : []),
     ]),
   ]));
   show($("dead"), [said.dead_cells.length
