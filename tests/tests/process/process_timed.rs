@@ -259,6 +259,9 @@ fn on_a_full_bus_nothing_is_missing_without_a_reason() {
     let own = check("--bus-time real:priority:4");
     // The same on a bus that another program serves, and again there: each run counts for itself.
     let server = serve(&place, "--rates 50k --queue priority:4");
+    let status = place.start("vcan-setup", "status").end().succeeded();
+    let expected = "frames on vcan0 take time: 50k, priority:4, 0 waiting, 0 refused\n";
+    assert!(status.stdout.contains(expected), "{}", status.stdout);
     for _ in 0..2 {
         let requested = check("--overwrite");
         assert!((own / 2..own * 3 / 2).contains(&requested), "{requested} of {own}");

@@ -7,8 +7,10 @@ use std::time::Duration;
 use clap::Args;
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use protocol::bus::BusKind;
+use protocol::bus::embedded::FiguresRequest;
 use protocol::usage::{Failure, print_text};
 use serde::Serialize;
+use vcan_setup::embedded::TimedReport;
 use vcan_setup::hosts::report as hosts;
 use vcan_setup::link::{
     CLASSIC_MTU, CanHardware, FD_MTU, HardwareRates, Interface, InterfaceCounters, InterfaceKind, Peer,
@@ -49,12 +51,17 @@ impl StatusOptions {
         let kernel = interfaces.iter().map(|interface| (interface.name.as_str(), BusKind::SocketCan));
         let user = embedded.iter().filter(|bus| bus.served).map(|bus| (bus.name.as_str(), BusKind::Embedded));
         let links = query_link_reports(kernel.chain(user));
+        let timed = query_timed_figures(&embedded);
         let text = match (self.json, interfaces.is_empty() && embedded.is_empty()) {
             (true, _) => {
                 let interfaces = interfaces.iter().map(|interface| interface_report(interface)).collect();
-                to_json(&StatusReport { interfaces, embedded: &embedded, links: &links })?
+                to_json(&StatusReport { interfaces, embedded: &embedded, timed: &timed, links: &links })?
             }
-            (false, false) => format_table(&interfaces, &embedded) + &format_link_reports(&links),
+            (false, false) => {
+                format_table(&interfaces, &embedded, &timed)
+                    + &format_timed_figures(&timed)
+                    + &format_link_reports(&links)
+            }
             (false, true) if target.is_empty() => {
                 "there is no CAN interface and no embedded bus\n".to_owned()
             }
@@ -91,6 +98,25 @@ fn query_link_reports<'a>(
     buses.filter_map(report).collect()
 }
 
+/// Returns the figures of the timed buses among these. A server that does not answer in time is left out.
+fn query_timed_figures(embedded: &[EmbeddedBus]) -> BTreeMap<&str, TimedReport> {
+    let figures = |bus: &EmbeddedBus| {
+        let answer = FiguresRequest::send(&bus.name, None).ok()?.receive(ANSWER_TIMEOUT)?;
+        TimedReport::from_json(&answer)
+    };
+    let served = embedded.iter().filter(|bus| bus.served);
+    served.filter_map(|bus| Some((bus.name.as_str(), figures(bus)?))).collect()
+}
+
+fn format_timed_figures(timed: &BTreeMap<&str, TimedReport>) -> String {
+    let line = |(bus, figures): (&&str, &TimedReport)| {
+        let load = figures.load.map_or_else(String::new, |load| format!("load {:.1} %, ", load * 100.0));
+        let TimedReport { rates, queue, waiting, refused, .. } = figures;
+        format!("frames on {bus} take time: {rates}, {queue}, {load}{waiting} waiting, {refused} refused\n")
+    };
+    timed.iter().map(line).collect()
+}
+
 fn format_link_reports(links: &BTreeMap<&str, hosts::LinkReport>) -> String {
     let host = |(name, host): (&String, &hosts::HostReport)| {
         let cells = host.nodes.len();
@@ -105,7 +131,11 @@ fn format_link_reports(links: &BTreeMap<&str, hosts::LinkReport>) -> String {
     links.iter().map(line).collect()
 }
 
-fn format_table(interfaces: &[&Interface], embedded: &[EmbeddedBus]) -> String {
+fn format_table(
+    interfaces: &[&Interface],
+    embedded: &[EmbeddedBus],
+    timed: &BTreeMap<&str, TimedReport>,
+) -> String {
     let mut table = Table::new();
     table.load_style(presets::NOTHING).set_content_arrangement(ContentArrangement::Disabled);
     let right = ["received", "sent", "dropped", "errors"];
@@ -126,7 +156,15 @@ fn format_table(interfaces: &[&Interface], embedded: &[EmbeddedBus]) -> String {
     }
     for EmbeddedBus { name, served, .. } in embedded {
         let state = if *served { "served" } else { "left by a server that was killed" };
-        table.add_row([name.as_str(), "embedded bus", "this user", state, if *served { "FD" } else { "" }]);
+        let rates = timed.get(name.as_str()).map_or("", |timed| timed.rates.as_str());
+        table.add_row([
+            name.as_str(),
+            "embedded bus",
+            "this user",
+            state,
+            if *served { "FD" } else { "" },
+            rates,
+        ]);
     }
     for column in table.column_iter_mut() {
         column.set_padding((0, 2));
@@ -200,6 +238,8 @@ fn bit_rates_text(interface: &Interface) -> String {
 struct StatusReport<'a> {
     interfaces: Vec<InterfaceReport<'a>>,
     embedded: &'a [EmbeddedBus],
+    /// The figures of timed buses.
+    timed: &'a BTreeMap<&'a str, TimedReport>,
     /// The reports of links to other hosts, by bus.
     links: &'a BTreeMap<&'a str, hosts::LinkReport>,
 }
