@@ -27,6 +27,14 @@ pub(super) struct PrefixedUnit {
     pub(super) unit: String,
 }
 
+/// The true minus sign. A hyphen is shorter, and lower than a plus.
+pub(super) const MINUS: &str = "−";
+
+/// Returns the text of a number with true minus signs instead of hyphens.
+pub(super) fn with_minus_signs(number: &str) -> String {
+    number.replace('-', MINUS)
+}
+
 /// Returns the unit as a static text if it takes prefixes.
 pub(super) fn prefixable_unit(unit: &str) -> Option<&'static str> {
     PREFIXABLE_UNITS.iter().find(|(name, ..)| *name == unit).map(|(name, ..)| *name)
@@ -100,7 +108,7 @@ fn decimals_for_two_digits(value: f64) -> Option<usize> {
 
 /// Formats a number with at most this number of decimals, without trailing zeros.
 fn format_with_decimals(value: f64, digits: usize) -> String {
-    let text = format!("{:.digits$}", value + 0.0);
+    let text = with_minus_signs(&format!("{:.digits$}", value + 0.0));
     if digits == 0 { text } else { text.trim_end_matches('0').trim_end_matches('.').to_owned() }
 }
 
@@ -121,7 +129,7 @@ fn format_unitless(value: f64) -> String {
 /// # use analysis::report::figure::format_number;
 /// assert_eq!(format_number(24_364.0), "24364");
 /// assert_eq!(format_number(0.005_4), "0.0054");
-/// assert_eq!(format_number(6.25e-5), "6.25e-5");
+/// assert_eq!(format_number(-6.25e-5), "−6.25·10⁻⁵");
 /// assert_eq!(format_number(1_919.4), "1919");
 /// ```
 #[must_use]
@@ -131,16 +139,37 @@ pub fn format_number(value: f64) -> String {
         return "–".to_owned();
     }
     if size < 1e6 && (value - value.round()).abs() < 1e-12 * size.max(1e-300) || size == 0.0 {
-        return format!("{:.0}", value + 0.0);
+        return format_with_decimals(value, 0);
     }
     if !(1e-4..1e6).contains(&size) {
-        let text = format!("{value:.2e}");
-        let Some((digits, exponent)) = text.split_once('e') else { return text };
-        return format!("{}e{exponent}", digits.trim_end_matches('0').trim_end_matches('.'));
+        return power_of_ten_text(&format!("{value:.2e}"));
     }
     let digits = [(100.0, 0), (10.0, 1), (1.0, 2), (0.1, 3), (0.01, 4), (0.001, 5)];
     let digits = digits.iter().find(|(from, _)| size >= *from).map_or(6, |(_, digits)| *digits);
     format_with_decimals(value, digits)
+}
+
+/// Writes a number in scientific notation with a power of ten: `2.50e-5` becomes `2.5·10⁻⁵`.
+pub(super) fn power_of_ten_text(scientific: &str) -> String {
+    let text = with_minus_signs(scientific);
+    let Some((digits, exponent)) = text.split_once('e') else { return text };
+    let digits = match digits.split_once('.') {
+        Some((whole, decimals)) => match decimals.trim_end_matches('0') {
+            "" => whole.to_owned(),
+            decimals => format!("{whole}.{decimals}"),
+        },
+        None => digits.to_owned(),
+    };
+    let exponent: String = exponent.chars().map(superscript).collect();
+    match digits.strip_suffix('1') {
+        Some(sign) if sign.is_empty() || sign == MINUS => format!("{sign}10{exponent}"),
+        _ => format!("{digits}·10{exponent}"),
+    }
+}
+
+fn superscript(digit: char) -> char {
+    let place = digit.to_digit(10).and_then(|digit| usize::try_from(digit).ok());
+    place.and_then(|place| "⁰¹²³⁴⁵⁶⁷⁸⁹".chars().nth(place)).unwrap_or('⁻')
 }
 
 #[cfg(test)]
@@ -155,12 +184,14 @@ mod tests {
             (-0.0, "0"),
             (1.0, "1"),
             (999_999.0, "999999"),
-            (2.5e7, "2.5e7"),
+            (2.5e7, "2.5·10⁷"),
+            (-1e7, "−10⁷"),
             (0.012_345, "0.0123"),
             (0.1, "0.1"),
-            (-12.349, "-12.3"),
-            (1.5e-7, "1.5e-7"),
-            (5e-5, "5e-5"),
+            (-12.349, "−12.3"),
+            (-7.0, "−7"),
+            (1.5e-7, "1.5·10⁻⁷"),
+            (5e-5, "5·10⁻⁵"),
             (f64::NAN, "–"),
         ] {
             assert_eq!(format_number(value), text);
@@ -172,7 +203,7 @@ mod tests {
         for (value, unit, text) in [
             (0.0, "Nm", "0 Nm"),
             (0.005_4, "Nm", "5.4 mNm"),
-            (-6.25e-5, "Nm", "-62.5 µNm"),
+            (-6.25e-5, "Nm", "−62.5 µNm"),
             (0.999_6, "Nm", "1 Nm"),
             (9.996e-4, "Nm", "1 mNm"),
             (2_500.0, "s", "2500 s"),
@@ -198,7 +229,7 @@ mod tests {
             (123.456, 34.7, "123 ± 35 ns"),
             (5.0, 123.4, "5 ± 123 ns"),
             (3.88, 0.0, "3.88 ± 0 ns"),
-            (3.88, 1e-9, "3.88 ± 1e-9 ns"),
+            (3.88, 1e-9, "3.88 ± 10⁻⁹ ns"),
             (3.88, f64::INFINITY, "3.88 ± – ns"),
         ] {
             assert_eq!(
@@ -224,7 +255,7 @@ mod tests {
             let (number, unit) = text.split_once('\u{a0}').unwrap();
             let prefix = unit.strip_suffix("Nm").unwrap();
             let (power, _) = SI_PREFIXES.iter().find(|(_, name)| *name == prefix).unwrap();
-            let number: f64 = number.parse().unwrap();
+            let number: f64 = number.replace(MINUS, "-").parse().unwrap();
             prop_assert!(number.abs() < 1_000.0 && number.abs() >= 1.0, "{text}");
             prop_assert!((number * 1_000_f64.powi(*power) / value - 1.0).abs() < 0.006, "{text} {value}");
         }

@@ -5,7 +5,7 @@ use std::ops::Range;
 use plotters::coord::ranged1d::{DefaultFormatting, KeyPointHint, Ranged};
 
 use super::figure::{Axis, Scale, format_quantity};
-use super::number::{PrefixedUnit, prefixable_unit, prefixed_unit};
+use super::number::{PrefixedUnit, power_of_ten_text, prefixable_unit, prefixed_unit, with_minus_signs};
 
 /// The range of an axis, with its mapping and unit.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -82,14 +82,13 @@ impl AxisSpan {
             Scale::Log if (0.01..1e5).contains(&tick) && self.unit.is_none() => {
                 format!("{}", round_tick(tick))
             }
-            Scale::Log => {
-                self.unit.map_or_else(|| power_of_ten_text(tick), |unit| format_quantity(tick, unit))
-            }
-            Scale::Linear if !(1e-3..1e6).contains(&size) => power_of_ten_text(tick * factor),
+            Scale::Log => self.unit.map_or_else(|| tick_power_text(tick), |unit| format_quantity(tick, unit)),
+            Scale::Linear if !(1e-3..1e6).contains(&size) => tick_power_text(tick * factor),
             Scale::Linear => {
                 let step = tick_step(self.from, self.to, most) * factor;
                 let digits = (0..9).find(|digits| step * 10_f64.powi(*digits) > 0.999).unwrap_or(9);
-                format!("{:.*}", usize::try_from(digits).unwrap_or(0), tick * factor + 0.0)
+                let digits = usize::try_from(digits).unwrap_or(0);
+                with_minus_signs(&format!("{:.digits$}", tick * factor + 0.0))
             }
         }
     }
@@ -185,25 +184,9 @@ fn round_tick(tick: f64) -> f64 {
     format!("{tick:.9}").parse().unwrap_or(tick)
 }
 
-/// Formats a number with a power of ten: `2·10⁻⁵`.
-fn power_of_ten_text(tick: f64) -> String {
-    if tick == 0.0 {
-        return "0".to_owned();
-    }
-    let text = format!("{tick:.3e}");
-    let Some((digits, exponent)) = text.split_once('e') else { return text };
-    let digits = digits.trim_end_matches('0').trim_end_matches('.');
-    let exponent: String = exponent.chars().map(superscript).collect();
-    if digits == "1" { format!("10{exponent}") } else { format!("{digits}·10{exponent}") }
-}
-
-fn superscript(digit: char) -> char {
-    let place = digit.to_digit(10).and_then(|digit| usize::try_from(digit).ok());
-    place.and_then(|place| "⁰¹²³⁴⁵⁶⁷⁸⁹".chars().nth(place)).unwrap_or(if digit == '-' {
-        '⁻'
-    } else {
-        digit
-    })
+/// Formats a tick with a power of ten: `2·10⁻⁵`.
+fn tick_power_text(tick: f64) -> String {
+    if tick == 0.0 { "0".to_owned() } else { power_of_ten_text(&format!("{tick:.3e}")) }
 }
 
 #[cfg(test)]
@@ -245,7 +228,7 @@ mod tests {
                 .join(" ")
         };
         assert_eq!(captions(0.0, 12.0, Scale::Linear, 8), "0 2 4 6 8 10 12");
-        assert_eq!(captions(-1.3, 0.4, Scale::Linear, 9), "-1.2 -1.0 -0.8 -0.6 -0.4 -0.2 0.0 0.2 0.4");
+        assert_eq!(captions(-1.3, 0.4, Scale::Linear, 9), "−1.2 −1.0 −0.8 −0.6 −0.4 −0.2 0.0 0.2 0.4");
         assert_eq!(captions(0.0, 2e-5, Scale::Linear, 4), "0 5·10⁻⁶ 10⁻⁵ 1.5·10⁻⁵ 2·10⁻⁵");
         assert_eq!(captions(1e-7, 0.04, Scale::Log, 6), "10⁻⁷ 10⁻⁶ 10⁻⁵ 10⁻⁴ 10⁻³ 0.01");
         assert_eq!(captions(15.0, 2_000.0, Scale::Log, 8), "20 50 100 200 500 1000 2000");
