@@ -16,8 +16,8 @@ use super::output::{OverwriteOption, check_distinct_files, is_standard_output, p
 
 /// Write a report on a recorded run: an HTML page with figures, compared with the paper's
 ///
-/// The page is self-contained, without network access or scripts, and readable on a phone, on a dark screen and on
-/// paper. For a recording that was cut off, the report covers the intact part, and names what is missing on the page
+/// The page is one file that loads nothing, and readable on a phone, on a dark screen and on paper. Pointer, finger or
+/// arrow keys show the values of its figures. For a recording that was cut off, the report covers the intact part, and names what is missing on the page
 /// and on standard error. A candump log holds only frames and needs its skin; the report names the parts that it lacks.
 /// Exit code 0: the report is written; 1: it cannot be written; 2: wrong use, or not a recording of a run.
 #[derive(Args, Debug)]

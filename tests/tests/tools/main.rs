@@ -7,5 +7,6 @@ mod tools_foxglove;
 mod tools_man;
 mod tools_power_loss;
 mod tools_recording;
+mod tools_report;
 mod tools_slcan;
 mod tools_view;

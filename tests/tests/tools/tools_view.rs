@@ -39,7 +39,7 @@ fn findings(browser: &mut Browser) -> Vec<String> {
 }
 
 /// Checks accessibility at two widths, light and dark.
-fn is_accessible(browser: &mut Browser) {
+pub(crate) fn is_accessible(browser: &mut Browser) {
     let axe = std::fs::read_to_string(AXE).expect("tests/tools/install makes axe-core ready");
     browser.value(&format!("{axe};0"));
     for (width, scheme) in [(1400, "light"), (1400, "dark"), (390, "light"), (390, "dark")] {

@@ -160,6 +160,13 @@ impl Figure {
         self
     }
 
+    /// Returns the title and all axes with their units, for readers who do not see the figure.
+    #[must_use]
+    pub fn description(&self) -> String {
+        let below = self.below.as_ref().map_or_else(String::new, |below| format!("; below: {}", below.y));
+        format!("{}. Vertical: {}{below}. Horizontal: {}.", self.title, self.y, self.x)
+    }
+
     /// Adds a second diagram below this one.
     #[must_use]
     pub fn with_lower_diagram(mut self, below: LowerDiagram) -> Self {

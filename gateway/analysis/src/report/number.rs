@@ -40,6 +40,15 @@ pub(super) fn prefixable_unit(unit: &str) -> Option<&'static str> {
     PREFIXABLE_UNITS.iter().find(|(name, ..)| *name == unit).map(|(name, ..)| *name)
 }
 
+/// Returns the size of a unit in its base unit, the base unit, and the highest power of a thousand of its prefixes;
+/// `None` for a unit without prefixes.
+pub(super) fn base_unit(unit: &str) -> Option<(f64, &'static str, i32)> {
+    PREFIXABLE_UNITS
+        .iter()
+        .find(|(name, ..)| *name == unit)
+        .map(|(_, size, base, most)| (*size, *base, *most))
+}
+
 /// Returns the unit with the prefix by which a value of this size becomes 1 to 999; `None` for a unit without prefixes.
 pub(super) fn prefixed_unit(size: f64, unit: &str) -> Option<PrefixedUnit> {
     let (_, scale, base, most) = *PREFIXABLE_UNITS.iter().find(|(name, ..)| *name == unit)?;
@@ -54,7 +63,7 @@ pub(super) fn prefixed_unit(size: f64, unit: &str) -> Option<PrefixedUnit> {
 }
 
 /// Rounds a value to three significant digits, as its text shows it.
-fn round_to_three_digits(value: f64) -> f64 {
+pub(super) fn round_to_three_digits(value: f64) -> f64 {
     format!("{value:.2e}").parse().unwrap_or(value)
 }
 

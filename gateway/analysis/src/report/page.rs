@@ -1,14 +1,16 @@
-//! Renders a page as one self-contained HTML file, without network or scripts.
+//! Renders a page as one self-contained HTML file. It loads nothing; its script only shows values under the pointer.
 
 use std::fmt::Write as _;
 
 use protocol::xml::escaped;
 
-use super::figure::{Figure, FigureWidth, Finding, FindingVerdict, Page, Section, Table};
+use super::figure::{Drawing, Figure, FigureWidth, Finding, FindingVerdict, Page, Section, Table};
 use super::svg;
 
 /// The style of all pages: light, dark on dark screens, and black on white for paper.
 const PAGE_CSS: &str = include_str!("page.css");
+/// The script of all pages. HTML ends it at `</script>`, and XML at the end of the section.
+const PAGE_SCRIPT: &str = include_str!("page.js");
 
 /// Renders a page, from its title to its last section, as the text of an HTML file.
 #[must_use]
@@ -19,7 +21,9 @@ pub fn page_html(page: &Page) -> String {
         out,
         "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\"/>\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n\
-         <meta name=\"color-scheme\" content=\"light dark\"/>\n<title>{title}</title>\n\
+         <meta name=\"color-scheme\" content=\"light dark\"/>\n\
+         <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; \
+         script-src 'unsafe-inline'\"/>\n<title>{title}</title>\n\
          <style>\n{PAGE_CSS}{}\n</style>\n</head>\n<body>\n<header>\n<h1>{title}</h1>\n",
         svg::dark_css_rules()
     );
@@ -45,7 +49,7 @@ pub fn page_html(page: &Page) -> String {
         }
         out.push_str("</dl>\n</footer>\n");
     }
-    out.push_str("</body>\n</html>\n");
+    let _ = write!(out, "<script>\n//<![CDATA[\n{PAGE_SCRIPT}//]]>\n</script>\n</body>\n</html>\n");
     out
 }
 
@@ -66,7 +70,11 @@ fn write_section(out: &mut String, section: &Section) {
     }
     for drawing in &section.drawings {
         let (name, title) = (escaped(drawing.name()), escaped(drawing.title()));
-        let _ = writeln!(out, "<figure class=\"wide\" id=\"{name}\">");
+        let values = match drawing {
+            Drawing::Strip(strip) => svg::strip_values(strip),
+            Drawing::Map(_) => String::new(),
+        };
+        let _ = writeln!(out, "<figure class=\"wide\" id=\"{name}\"{values}>");
         out.push_str(&svg::inline_cells(drawing, svg::natural_size(FigureWidth::Wide).0, "desk"));
         out.push_str(&svg::inline_cells(drawing, svg::natural_size(FigureWidth::Half).0, "hand"));
         let _ = writeln!(out, "<figcaption>{title}</figcaption>\n</figure>");
@@ -286,8 +294,17 @@ mod tests {
         assert_eq!(text(all("h1")[0]), "A page & more");
         assert_eq!(all("figure").len(), 6);
         assert_eq!(all("svg").len(), 9, "a wide figure has a drawing for the hand");
-        assert!(all("script").is_empty() && all("img").is_empty() && all("link").is_empty());
-        assert!(!html.replace("http://www.w3.org/2000/svg", "").contains("http"), "nothing is fetched");
+        assert_eq!(all("script").len(), 1, "its own");
+        assert!(all("script")[0].attributes().len() == 0 && all("img").is_empty() && all("link").is_empty());
+        assert!(!html.replace("http://www.w3.org/2000/svg", "").contains("://"), "nothing is fetched");
+        let policy = all("meta")
+            .into_iter()
+            .find_map(|meta| meta.attribute("content").filter(|_| meta.has_attribute("http-equiv")));
+        assert!(policy.unwrap().starts_with("default-src 'none';"));
+        for drawing in all("svg") {
+            let label = drawing.attribute("aria-label").unwrap();
+            assert!(label.ends_with(" <&>. Vertical: torque (Nm). Horizontal: time (s)."), "{label}");
+        }
         let names: Vec<_> = document.descendants().filter_map(|node| node.attribute("id")).collect();
         for link in all("a") {
             let to = link.attribute("href").unwrap().strip_prefix('#').unwrap();

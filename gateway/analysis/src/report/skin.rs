@@ -2,6 +2,8 @@
 
 use serde::Serialize;
 
+use super::number::format_quantity;
+
 /// A drawing of the cells of a skin.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub enum Drawing {
@@ -19,6 +21,17 @@ impl Drawing {
             Self::Strip(strip) => &strip.name,
             Self::Map(map) => &map.name,
         }
+    }
+
+    /// Returns the title and the meaning of colours and axes, for readers who do not see the drawing.
+    #[must_use]
+    pub fn description(&self) -> String {
+        let (legend, more) = match self {
+            Self::Strip(strip) => (&strip.legend, " Vertical: cells. Horizontal: time (s)."),
+            Self::Map(map) => (&map.legend, ""),
+        };
+        let max = format_quantity(legend.max, &legend.unit);
+        format!("{}. Colours: {}, 0 to {max}.{more}", self.title(), legend.caption)
     }
 
     /// Returns the caption of the drawing.

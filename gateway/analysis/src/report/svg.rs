@@ -1,14 +1,15 @@
 //! Draws a figure as SVG.
 //!
 //! The drawing contains the colours for paper, so that every program can show it. Each colour also has a class, with
-//! which [`dark_css_rules()`] replaces it on a dark_css_rules screen.
+//! which [`dark_css_rules()`] replaces it on a dark screen.
 
 mod cells;
 mod colour;
+mod palette;
+mod reading;
 
-pub use cells::{draw_cells, draw_inline as inline_cells};
-
-use std::fmt::Write as _;
+pub use cells::{draw_cells, draw_inline as inline_cells, strip_values};
+pub use palette::dark_css_rules;
 
 use plotters::chart::{ChartBuilder, ChartContext};
 use plotters::coord::Shift;
@@ -23,6 +24,8 @@ use protocol::xml::escaped;
 use super::figure::{Axis, Figure, FigureWidth, MarkAxis, MarkLine, Series, SeriesShape};
 use super::scale::AxisSpan;
 use super::thin::thin_points;
+use palette::{COLOUR_CLASSES, FAINT_TEXT_COLOUR, GRID_COLOUR, TEXT_COLOUR, series_colours};
+use reading::{ReadableAxis, ReadablePlot, data_attribute};
 
 /// Number of drawing units per pixel, so that positions are whole numbers.
 const UNITS_PER_PIXEL: i32 = 8;
@@ -36,42 +39,6 @@ const LINE_WIDTH: u32 = 13;
 const DASHED_LINE_WIDTH: u32 = 14;
 const DOTTED_LINE_WIDTH: u32 = 9;
 const DASH_PATTERNS: [(u32, &str); 2] = [(DASHED_LINE_WIDTH, "56 36"), (DOTTED_LINE_WIDTH, "16 24")];
-
-/// Colour on paper, CSS class, and colour on a dark screen: for text, faint text, the grid, and each series. The series
-/// have Okabe and Ito's colours, which colour-blind readers can distinguish; their yellow is omitted because it is
-/// invisible on white.
-const COLOUR_CLASSES: [(RGBColor, &str, &str); 3 + Figure::COLOUR_COUNT] = [
-    (TEXT_COLOUR, "ink", "#E4E4E4"),
-    (FAINT_TEXT_COLOUR, "faint", "#A6A6A6"),
-    (GRID_COLOUR, "grid", "#3A3D42"),
-    (RGBColor(0x00, 0x72, 0xB2), "c0", "#5AB4F0"),
-    (RGBColor(0xD5, 0x5E, 0x00), "c1", "#FF8A3D"),
-    (RGBColor(0x00, 0x9E, 0x73), "c2", "#35C79A"),
-    (RGBColor(0xCC, 0x79, 0xA7), "c3", "#E59AC8"),
-    (RGBColor(0xE6, 0x9F, 0x00), "c4", "#F5C04A"),
-    (RGBColor(0x56, 0xB4, 0xE9), "c5", "#A8DCFF"),
-    (RGBColor(0x33, 0x33, 0x33), "c6", "#DDDDDD"),
-];
-const TEXT_COLOUR: RGBColor = RGBColor(0x22, 0x22, 0x22);
-const FAINT_TEXT_COLOUR: RGBColor = RGBColor(0x6B, 0x6B, 0x6B);
-const GRID_COLOUR: RGBColor = RGBColor(0xDD, 0xDD, 0xDD);
-
-/// Returns the colours of the series in order, repeated without end.
-fn series_colours() -> impl Iterator<Item = RGBColor> {
-    COLOUR_CLASSES.iter().skip(3).cycle().map(|(colour, ..)| *colour)
-}
-
-/// Returns the CSS rules with the colours for dark screens.
-#[must_use]
-pub fn dark_css_rules() -> String {
-    let mut rules = "@media screen and (prefers-color-scheme:dark){".to_owned();
-    for (_, class, colour) in COLOUR_CLASSES {
-        let _ = write!(rules, ".{class}-f{{fill:{colour}}}.{class}-s{{stroke:{colour}}}");
-    }
-    colour::add_dark_rules(&mut rules);
-    rules.push('}');
-    rules
-}
 
 /// Returns the width and the height of a figure in pixels, before scaling.
 #[must_use]
@@ -95,31 +62,43 @@ pub fn draw_figure(figure: &Figure) -> String {
     let (width, height) = figure_size(figure, figure.size);
     let style = format!("<style>{}</style>\n", dark_css_rules());
     let attributes = format!("width=\"{width}\" height=\"{height}\" font-family=\"sans-serif\"");
-    svg_document(figure, (width, height), &attributes, &style)
+    // Other programs show the title of a file; in a page it would cover the values that the script shows.
+    let title = format!("<title>{}</title>\n", escaped(&figure.title));
+    let (_, body) = draw(figure, (width, height));
+    svg_document(figure, (width, height), &attributes, &format!("{title}{style}{body}"))
 }
 
 /// Draws a figure as an element of a page that contains the CSS rules of [`dark_css_rules()`]; `size` is the size in
-/// pixels before scaling.
+/// pixels before scaling. The page's script reads the values.
 #[must_use]
 pub fn draw_inline(figure: &Figure, size: (u32, u32), class: &str) -> String {
-    svg_document(figure, size, &format!("class=\"{class}\""), "")
+    let (plots, body) = draw(figure, size);
+    svg_document(figure, size, &format!("class=\"{class}\"{}", data_attribute("plots", &plots)), &body)
 }
 
-fn svg_document(figure: &Figure, (width, height): (u32, u32), attributes: &str, style: &str) -> String {
+/// Returns the diagrams of a figure as a script reads them, and the SVG elements with the end of the document.
+fn draw(figure: &Figure, (width, height): (u32, u32)) -> (Vec<ReadablePlot>, String) {
     let unit = UNITS_PER_PIXEL.unsigned_abs();
     let mut drawing = String::new();
     let area = SVGBackend::with_string(&mut drawing, (width * unit, height * unit)).into_drawing_area();
     // A drawing in memory can only fail if the area is too small.
-    let drawn = draw_diagrams(figure, &area).and_then(|()| area.present());
+    let drawn = draw_diagrams(figure, &area).and_then(|plots| area.present().map(|()| plots));
     drop(area);
     let body = drawing.split_once(">\n").map_or("", |(_, body)| body);
-    let body = if drawn.is_ok() { add_css_classes(body) } else { "</svg>\n".to_owned() };
-    let title = escaped(&figure.title);
+    match drawn {
+        Ok(plots) => (plots, add_css_classes(body)),
+        Err(_) => (Vec::new(), "</svg>\n".to_owned()),
+    }
+}
+
+fn svg_document(figure: &Figure, (width, height): (u32, u32), attributes: &str, body: &str) -> String {
+    let unit = UNITS_PER_PIXEL.unsigned_abs();
     format!(
-        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {} {}\" role=\"img\" {attributes} \
-         stroke-linejoin=\"round\">\n<title>{title}</title>\n{style}{body}",
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {} {}\" role=\"img\" aria-label=\"{}\" {attributes} \
+         stroke-linejoin=\"round\">\n{body}",
         width * unit,
-        height * unit
+        height * unit,
+        escaped(&figure.description())
     )
 }
 
@@ -141,7 +120,7 @@ fn add_css_classes(body: &str) -> String {
 
 type SvgArea<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 type SvgChart<'a, 'b> = ChartContext<'b, SVGBackend<'a>, Cartesian2d<AxisSpan, AxisSpan>>;
-type DrawResult = Result<(), DrawingAreaErrorKind<std::io::Error>>;
+type DrawResult<T = ()> = Result<T, DrawingAreaErrorKind<std::io::Error>>;
 
 /// One of the diagrams of a figure.
 #[derive(Clone, Copy)]
@@ -190,7 +169,7 @@ impl<'a> Diagram<'a> {
     }
 }
 
-fn draw_diagrams(figure: &Figure, area: &SvgArea<'_>) -> DrawResult {
+fn draw_diagrams(figure: &Figure, area: &SvgArea<'_>) -> DrawResult<Vec<ReadablePlot>> {
     let diagrams = Diagram::from_figure(figure);
     let (_, height) = area.dim_in_pixel();
     let (upper, lower) = match figure.below {
@@ -205,10 +184,10 @@ fn draw_diagrams(figure: &Figure, area: &SvgArea<'_>) -> DrawResult {
     // Both diagrams have the same left edge.
     let left = pixels_to_units(34)
         + pixels_to_signed_units(0.62 * LETTER_SIZE_PX * digits.max().unwrap_or(1) as f64).unsigned_abs();
-    diagrams.iter().zip(&areas).try_for_each(|(diagram, area)| draw_diagram(diagram, area, left))
+    diagrams.iter().zip(&areas).map(|(diagram, area)| draw_diagram(diagram, area, left)).collect()
 }
 
-fn draw_diagram(diagram: &Diagram<'_>, area: &SvgArea<'_>, left: u32) -> DrawResult {
+fn draw_diagram(diagram: &Diagram<'_>, area: &SvgArea<'_>, left: u32) -> DrawResult<ReadablePlot> {
     let Diagram { axes, x, y, series, marks, is_lowest } = *diagram;
     let (width, height) = area.dim_in_pixel();
     let (x_most, y_most) = ((width / pixels_to_units(80)) as usize, Diagram::max_ticks(height));
@@ -239,33 +218,46 @@ fn draw_diagram(diagram: &Diagram<'_>, area: &SvgArea<'_>, left: u32) -> DrawRes
         .draw()?;
     let (columns, lines) = chart.plotting_area().dim_in_pixel();
     let grain = (columns / UNITS_PER_PIXEL.unsigned_abs(), lines / UNITS_PER_PIXEL.unsigned_abs());
+    let mut elements = Vec::with_capacity(series.len());
     for (series, colour) in series.iter().zip(series_colours()) {
-        draw_series(&mut chart, series, colour, (&x, &y), grain)?;
+        let name = if series.caption.is_empty() { &axes.1.caption } else { &series.caption };
+        elements.push((name.clone(), draw_series(&mut chart, series, colour, (&x, &y), grain)?));
     }
     for mark in marks {
         draw_mark(&mut chart, mark, (&x, &y))?;
     }
+    let mut keys = 0;
     for (row, entries) in (0..).zip(&rows) {
         for (at, series, colour) in entries {
             draw_legend_entry(&above, series, *colour, (*at, row))?;
+            keys += if series.shape == SeriesShape::Dashed { 2 } else { 1 };
         }
     }
-    Ok(())
+    let corner = |place: f64| chart.backend_coord(&(x.value_at(place), y.value_at(place)));
+    let (from, to) = (corner(0.0), corner(1.0));
+    Ok(ReadablePlot {
+        x: ReadableAxis::new(axes.0, &x, [from.0, to.0].map(f64::from)),
+        y: ReadableAxis::new(axes.1, &y, [from.1, to.1].map(f64::from)),
+        series: elements,
+        keys,
+    })
 }
 
+/// Draws a series, and returns the number of its elements.
 fn draw_series(
     chart: &mut SvgChart<'_, '_>,
     series: &Series,
     colour: RGBColor,
     (x, y): (&AxisSpan, &AxisSpan),
     (columns, lines): (u32, u32),
-) -> DrawResult {
+) -> DrawResult<usize> {
     let placed = series.points.iter().map(|point| (x.position(point.0), y.position(point.1)));
     let style =
         colour.stroke_width(if series.shape == SeriesShape::Dashed { DASHED_LINE_WIDTH } else { LINE_WIDTH });
     let back = |points: Vec<(f64, f64)>| -> Vec<(f64, f64)> {
         points.into_iter().map(|(across, up)| (x.value_at(across), y.value_at(up))).collect()
     };
+    let mut elements = 0;
     match series.shape {
         SeriesShape::Line | SeriesShape::Dashed | SeriesShape::Steps => {
             for run in line_pieces(&placed.collect::<Vec<_>>()) {
@@ -274,6 +266,7 @@ fn draw_series(
                 for piece in clip_line(&run) {
                     let points = back(piece);
                     chart.draw_series([PathElement::new(points, style)])?;
+                    elements += 1;
                 }
             }
         }
@@ -289,6 +282,7 @@ fn draw_series(
             }
             let radius =
                 if points.len() > 300 { pixels_to_signed_units(1.2) } else { pixels_to_signed_units(2.6) };
+            elements = points.len();
             chart.draw_series(
                 back(points).into_iter().map(|point| Circle::new(point, radius, colour.filled())),
             )?;
@@ -299,9 +293,10 @@ fn draw_series(
                 .map(|point| (point.0.clamp(0.0, 1.0), point.1.clamp(0.0, 1.0)))
                 .collect();
             chart.draw_series([Polygon::new(back(points), colour.mix(0.25).filled())])?;
+            elements = 1;
         }
     }
-    Ok(())
+    Ok(elements)
 }
 
 /// Returns true if a point, given as positions from 0 to 1, is inside the diagram.

@@ -3,13 +3,17 @@
 use std::fmt::Write as _;
 
 use protocol::xml::escaped;
+use serde::Serialize;
 
 use super::super::figure::{
     Axis, CellMap, CellStrip, ColourLegend, Drawing, FigureWidth, LinkPanel, format_quantity,
 };
+use super::super::number::round_to_three_digits;
 use super::super::scale::AxisSpan;
 use super::colour::{BACKGROUND_COLOURS, COLOUR_LEVEL_COUNT, colour_level, level_colours};
-use super::{FAINT_TEXT_COLOUR, LETTER_SIZE_PX, TEXT_COLOUR, dark_css_rules, natural_size};
+use super::palette::{FAINT_TEXT_COLOUR, TEXT_COLOUR, dark_css_rules};
+use super::reading::{ReadableAxis, ReadableUnit, data_attribute};
+use super::{LETTER_SIZE_PX, natural_size};
 
 /// Mean width of a letter, in pixels.
 const LETTER_WIDTH_PX: f64 = 0.56 * LETTER_SIZE_PX;
@@ -29,37 +33,92 @@ const SINGLE_CELL_PITCH_M: f64 = 0.028;
 /// Draws a standalone SVG file.
 #[must_use]
 pub fn draw_cells(drawing: &Drawing) -> String {
-    let style = format!("<style>{}</style>\n", dark_css_rules());
+    let style = format!("<title>{}</title>\n<style>{}</style>\n", escaped(drawing.title()), dark_css_rules());
     let (width, _) = natural_size(FigureWidth::Wide);
-    let (height, body) = draw_body(drawing, width.into());
+    let Body { height, elements, .. } = draw_body(drawing, width.into());
     let attributes = format!("width=\"{width}\" height=\"{height}\" font-family=\"sans-serif\"");
-    svg_document(drawing, (width.into(), height), &attributes, &format!("{style}{body}"))
+    svg_document(drawing, (width.into(), height), &attributes, &format!("{style}{elements}"))
 }
 
 /// Draws cells as an element of a page that contains the CSS rules of [`dark_rules`](super::dark_css_rules); `width` is
 /// the width in pixels before scaling.
 #[must_use]
 pub fn draw_inline(drawing: &Drawing, width: u32, class: &str) -> String {
-    let (height, body) = draw_body(drawing, width.into());
-    svg_document(drawing, (width.into(), height), &format!("class=\"{class}\""), &body)
+    let Body { height, data, elements } = draw_body(drawing, width.into());
+    svg_document(drawing, (width.into(), height), &format!("class=\"{class}\"{data}"), &elements)
+}
+
+/// Returns the values of each row of a strip as an attribute, from which the script of a page reads them: runs of equal
+/// intervals, each with its start and interval in s, and the values.
+#[must_use]
+pub fn strip_values(strip: &CellStrip) -> String {
+    let rows = strip.groups.iter().flat_map(|group| &group.rows);
+    let runs: Vec<Vec<(f64, f64, Vec<f64>)>> = rows
+        .map(|row| {
+            let follows = |one: &(f64, f64, f64), next: &(f64, f64, f64)| {
+                let (step, next_step) = (one.1 - one.0, next.1 - next.0);
+                (next.0 - one.1).abs() < 1e-6 && (next_step - step).abs() < 1e-6
+            };
+            let runs = row.values.chunk_by(follows).filter_map(|run| {
+                let (from, to, _) = run.first()?;
+                let values = run.iter().map(|(.., value)| round_to_three_digits(*value)).collect();
+                Some((round_to_micros(*from), round_to_micros(to - from), values))
+            });
+            runs.collect()
+        })
+        .collect();
+    data_attribute("values", &runs)
+}
+
+/// Rounds a time in s to µs.
+fn round_to_micros(seconds: f64) -> f64 {
+    (seconds * 1e6).round() / 1e6
 }
 
 fn svg_document(drawing: &Drawing, (width, height): (f64, f64), attributes: &str, body: &str) -> String {
-    let title = escaped(drawing.title());
+    let label = escaped(&drawing.description());
     format!(
-        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width} {height}\" role=\"img\" {attributes} \
-         font-size=\"{LETTER_SIZE_PX}\">\n<title>{title}</title>\n{body}</svg>\n"
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width} {height}\" role=\"img\" aria-label=\"{label}\" \
+         {attributes} font-size=\"{LETTER_SIZE_PX}\">\n{body}</svg>\n"
     )
 }
 
-/// Returns the height of a drawing in pixels and the text of its SVG elements.
-fn draw_body(drawing: &Drawing, width: f64) -> (f64, String) {
-    let mut out = String::new();
-    let height = match drawing {
-        Drawing::Strip(strip) => write_strip(&mut out, strip, width),
-        Drawing::Map(map) => write_map(&mut out, map, width),
+/// The contents of a drawing.
+struct Body {
+    /// Height in pixels.
+    height: f64,
+    /// The attribute from which the script of a page reads values.
+    data: String,
+    /// The SVG elements.
+    elements: String,
+}
+
+fn draw_body(drawing: &Drawing, width: f64) -> Body {
+    let mut elements = String::new();
+    let (height, data) = match drawing {
+        Drawing::Strip(strip) => {
+            let (height, readable) = write_strip(&mut elements, strip, width);
+            (height, data_attribute("strip", &readable))
+        }
+        Drawing::Map(map) => (write_map(&mut elements, map, width), data_attribute("map", &())),
     };
-    (height.ceil(), out)
+    Body { height: height.ceil(), data, elements }
+}
+
+/// A strip as a script reads it, beside the values of [`strip_values`].
+#[derive(Serialize)]
+struct ReadableStrip {
+    x: ReadableAxis,
+    /// Top and height of each row, and the name of its cell.
+    rows: Vec<(f64, f64, String)>,
+    legend: ReadableLegend,
+}
+
+#[derive(Serialize)]
+struct ReadableLegend {
+    caption: String,
+    #[serde(flatten)]
+    unit: ReadableUnit,
 }
 
 /// The alignment of a text.
@@ -144,7 +203,7 @@ fn write_legend(out: &mut String, legend: &ColourLegend, width: f64) {
     }
 }
 
-fn write_strip(out: &mut String, strip: &CellStrip, width: f64) -> f64 {
+fn write_strip(out: &mut String, strip: &CellStrip, width: f64) -> (f64, ReadableStrip) {
     write_legend(out, &strip.legend, width);
     let rows: usize = strip.groups.iter().map(|group| group.rows.len()).sum();
     let row = if rows > 20 { 14.0 } else { 18.0 };
@@ -155,12 +214,14 @@ fn write_strip(out: &mut String, strip: &CellStrip, width: f64) -> f64 {
     let span = AxisSpan::new(&time, [].into_iter(), 0.0);
     let place = |seconds: f64| left + span.position(seconds).clamp(0.0, 1.0) * (right - left);
     let (mut tracks, mut levels, mut y) = (String::new(), LevelPaths::default(), LEGEND_HEIGHT_PX);
+    let mut readable = Vec::new();
     for group in &strip.groups {
         write_text(out, (MARGIN_PX, y + 16.0), TextAnchor::Start, false, &group.title);
         y += HEADING_HEIGHT_PX;
         for of_cell in &group.rows {
             write_text(out, (left - 8.0, y + row * 0.5 + 4.5), TextAnchor::End, true, &of_cell.caption);
             add_rectangle(&mut tracks, (left, y), (right - left, row - 2.0));
+            readable.push((y, row - 2.0, format!("cell {}, {}", of_cell.caption, group.title)));
             for (from, to, value) in &of_cell.values {
                 let (from, to) = (place(*from), place(*to));
                 let path = levels.path_of_value(*value, strip.legend.max);
@@ -183,7 +244,9 @@ fn write_strip(out: &mut String, strip: &CellStrip, width: f64) -> f64 {
     }
     write_line(out, &axis);
     write_text(out, ((left + right) / 2.0, y + 38.0), TextAnchor::Middle, false, &span.title(&time));
-    y + 46.0
+    let (caption, unit) = (strip.legend.caption.clone(), ReadableUnit::new(&strip.legend.unit));
+    let x = ReadableAxis::new(&time, &span, [left, right]);
+    (y + 46.0, ReadableStrip { x, rows: readable, legend: ReadableLegend { caption, unit } })
 }
 
 /// The cells of one panel, and the area that they cover in m.

@@ -172,3 +172,56 @@ fn a_diagram_below_has_its_own_scale_and_the_same_time() {
     assert_eq!(words.iter().filter(|word| **word == "time (s)").count(), 1, "{words:?}");
     assert!(words.contains(&"torque (kNm)") && words.contains(&"difference (µNm)"), "{words:?}");
 }
+
+/// Returns the diagrams of a drawing in a page, as a script reads them.
+fn readable(text: &str) -> serde_json::Value {
+    let document = Document::parse(text).unwrap();
+    serde_json::from_str(document.root_element().attribute("data-plots").unwrap()).unwrap()
+}
+
+#[test]
+fn a_script_finds_the_elements_of_each_series_and_their_values() {
+    let gap = [(0.0, 0.5), (2.0, 0.5), (3.0, f64::NAN), (4.0, 0.5), (5.0, 0.25)];
+    let shapes = [SeriesShape::Dashed, SeriesShape::Points, SeriesShape::Band, SeriesShape::Line];
+    let mut series: Vec<_> = shapes.map(|shape| Series::new("<&>\"", shape, gap.to_vec())).into();
+    series.extend((0..Figure::COLOUR_COUNT).map(|_| Series::new("", SeriesShape::Steps, gap.to_vec())));
+    let below = LowerDiagram {
+        y: Axis::new("error", "Nm").with_ends(1e-6, 1e-2).with_log_scale(),
+        series: vec![Series::new("", SeriesShape::Line, vec![(5.0, 1e-4), (10.0, 1e-4)])],
+        marks: vec![MarkLine::at_y(1e-3, "limit")],
+    };
+    let figure = figure(series).with_lower_diagram(below);
+    let text = draw_inline(&figure, figure_size(&figure, FigureWidth::Half), "both");
+    let document = Document::parse(&text).unwrap();
+    let coloured = |node: &Node<'_, '_>| {
+        let class = node.attribute("class").unwrap_or_default();
+        node.tag_name().name() != "text" && class.starts_with('c') && class[1..2].parse::<u8>().is_ok()
+    };
+    let drawn: Vec<_> = document.descendants().filter(coloured).collect();
+    let plots = readable(&text);
+    let mut next = 0;
+    for (at, plot) in plots.as_array().unwrap().iter().enumerate() {
+        for (index, one) in plot["series"].as_array().unwrap().iter().enumerate() {
+            let count = usize::try_from(one[1].as_u64().unwrap()).unwrap();
+            let class = format!("c{}", index % Figure::COLOUR_COUNT);
+            let own = &drawn[next..next + count];
+            assert!(count > 0 && own.iter().all(|node| node.attribute("class").unwrap().starts_with(&class)));
+            next += count;
+            let name = ["<&>\"", "torque", "error"][if at == 1 { 2 } else { usize::from(index >= 4) }];
+            assert_eq!(one[0], name);
+        }
+        next += usize::try_from(plot["keys"].as_u64().unwrap()).unwrap();
+    }
+    assert_eq!(next, drawn.len(), "all elements are of a series or a legend");
+
+    // The place of a point is the value that was drawn.
+    let last = lines(&document, "c0-s").pop().unwrap()[0];
+    let part = |axis: &serde_json::Value, place: f64| {
+        let [from, to] = [0, 1].map(|end| axis["at"][end].as_f64().unwrap());
+        (place - from) / (to - from)
+    };
+    let [x, y] = ["x", "y"].map(|axis| &plots[1][axis]);
+    assert_eq!((&x["ends"], &y["ends"]), (&serde_json::json!([0.0, 10.0]), &serde_json::json!([1e-6, 1e-2])));
+    assert!((part(x, last.0) - 0.5).abs() < 1e-3 && (part(y, last.1) - 0.5).abs() < 2e-3, "{last:?} {y}");
+    assert_eq!((&y["log"], &y["base"], &plots[0]["y"]["log"]), (&true.into(), &"Nm".into(), &false.into()));
+}

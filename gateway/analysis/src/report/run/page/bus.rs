@@ -63,7 +63,7 @@ impl PageDraft<'_> {
             [("due", &bus_figures.lines.due), ("in time", &bus_figures.lines.in_time)],
             [("late", &bus_figures.lines.late), ("missing", &bus_figures.lines.missing)],
         ];
-        let mut figures = vec![steps("replies", "replies due and in time, per epoch", y.clone(), due)];
+        let mut figures = vec![steps("replies", "due and in time, per epoch", y.clone(), due)];
         figures.extend((lost > 0).then(|| steps("late", "late and missing, when detected", y, late)));
         let slowest = self.time_figure(format!("slowest-{name}"), slowest, Axis::new("time", "ms"));
         let slowest = slowest

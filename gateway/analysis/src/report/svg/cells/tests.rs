@@ -47,7 +47,7 @@ fn a_strip_has_each_value_at_its_time_in_its_row_and_colour() {
         groups,
         ..CellStrip::default()
     };
-    let text = draw_cells(&Drawing::Strip(strip));
+    let text = draw_cells(&Drawing::Strip(strip.clone()));
     let document = Document::parse(&text).unwrap();
     let tracks = rectangles(path(&document, "track").unwrap());
     let [first, second, third] = tracks[..] else { panic!("{tracks:?}") };
@@ -62,6 +62,20 @@ fn a_strip_has_each_value_at_its_time_in_its_row_and_colour() {
     }
     let [quarter] = rectangles(path(&document, "v3").unwrap())[..] else { panic!("one") };
     near(quarter[0], left + wide / 2.0);
+    // What a script reads: rows where they are drawn, and values in runs.
+    let inline = draw_inline(&Drawing::Strip(strip.clone()), 960, "both");
+    let inline = Document::parse(&inline).unwrap();
+    let label = inline.root_element().attribute("aria-label").unwrap();
+    assert_eq!(label, "a < b. Colours: force, 0 to 4\u{a0}N. Vertical: cells. Horizontal: time (s).");
+    let readable: serde_json::Value =
+        serde_json::from_str(inline.root_element().attribute("data-strip").unwrap()).unwrap();
+    assert_eq!(readable["rows"][1], serde_json::json!([second[1], second[3], "cell 8, link 2"]));
+    assert_eq!(
+        (&readable["x"]["ends"], &readable["legend"]["base"]),
+        (&serde_json::json!([0.0, 10.0]), &"N".into())
+    );
+    let values = strip_values(&strip);
+    assert_eq!(values, " data-values=\"[[[0.0,5.0,[4.0]]],[[5.0,5.0,[1.0]]],[[2.5,2.5,[4.0]]]]\"");
     let words: Vec<_> = document
         .descendants()
         .filter(|node| node.has_tag_name((SVG, "text")))
