@@ -58,7 +58,7 @@ impl ReportCommand {
             _ => PathBuf::from("report.html"),
         };
         let output = self.output.clone().unwrap_or(page);
-        let read = |file: &Path| Ok::<_, Failure>((file.display().to_string(), read_skin(file)?));
+        let read = |file: &Path| Ok::<_, Failure>((file.to_owned(), read_skin(file)?));
         let skin = self.skin.as_deref().map(read).transpose()?;
         let command = command_line().join(" ");
         let options = run::ReportOptions { command, nominal: self.nominal, data: self.data, skin };
@@ -120,7 +120,7 @@ impl ReportCommand {
 
 /// Converts an error of a report into a failure. A file that is not a recording of a run counts as wrong use; an
 /// unreadable file does not.
-fn report_failure(error: ReportError, skin: Option<&(String, Skin)>) -> Failure {
+fn report_failure(error: ReportError, skin: Option<&(PathBuf, Skin)>) -> Failure {
     match (error, skin) {
         (error @ (ReportError::Capture(_) | ReportError::Unfinished { .. }), _) => Failure::run_error(error),
         (ReportError::OtherSkin { name, recorded }, Some((file, skin))) => {
@@ -128,8 +128,9 @@ fn report_failure(error: ReportError, skin: Option<&(String, Skin)>) -> Failure 
             let first =
                 first.map_or_else(String::new, |(what, is, was)| format!(" ({what}: {is}, recorded: {was})"));
             Failure::usage_error(format!(
-                "{name} was recorded with a skin that differs from {file}{first}: leave out --skin, because \
-                 the recording contains its skin"
+                "{name} was recorded with a skin that differs from {}{first}: leave out --skin, because \
+                 the recording contains its skin",
+                file.display()
             ))
         }
         (error, _) => Failure::usage_error(error),

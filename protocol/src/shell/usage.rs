@@ -203,20 +203,30 @@ pub fn shell_quoted(word: &str) -> Cow<'_, str> {
     Cow::Owned(format!("'{}'", word.replace('\'', quote)))
 }
 
-/// Quotes a word that need not be UTF-8 for a shell. A word that is not UTF-8 becomes `$'...'`, which bash and zsh
+/// Quotes a word that need not be UTF-8 or printable for a shell. Such a word becomes `$'...'`, which bash and zsh
 /// support.
 #[must_use]
 pub fn shell_quoted_os(word: &OsStr) -> String {
-    if let Some(word) = word.to_str() {
+    if let Some(word) = word.to_str().filter(|word| !word.contains(is_unprintable)) {
         return shell_quoted(word).into_owned();
     }
     let mut whole = "$'".to_owned();
-    for chunk in word.as_encoded_bytes().utf8_chunks() {
-        whole += &chunk.valid().replace('\\', r"\\").replace('\'', r"\'");
-        for byte in chunk.invalid() {
+    let escape = |whole: &mut String, bytes: &[u8]| {
+        for byte in bytes {
             // Writing to a string cannot fail.
             let _ = write!(whole, r"\x{byte:02x}");
         }
+    };
+    for chunk in word.as_encoded_bytes().utf8_chunks() {
+        for letter in chunk.valid().chars() {
+            match letter {
+                '\\' => whole += r"\\",
+                '\'' => whole += r"\'",
+                _ if is_unprintable(letter) => escape(&mut whole, letter.encode_utf8(&mut [0; 4]).as_bytes()),
+                _ => whole.push(letter),
+            }
+        }
+        escape(&mut whole, chunk.invalid());
     }
     whole + "'"
 }
@@ -300,11 +310,13 @@ mod tests {
     }
     #[test]
     fn the_shell_reads_a_quoted_word_as_it_was() {
-        for word in [b"n\xff.mcap".as_slice(), b"\xff\xfe'\\x41 $HOME", b"plain", b"two words"] {
+        let unprintable = "line\nfeed\u{1b}[0m\u{202e}1'\\".as_bytes();
+        for word in [b"n\xff.mcap".as_slice(), b"\xff\xfe'\\x41 $HOME", b"plain", b"two words", unprintable] {
             let word = OsStr::from_bytes(word);
             let script = format!("printf %s {}", shell_quoted_os(word));
             let read = std::process::Command::new("bash").args(["-c", &script]).output().unwrap();
             assert_eq!(OsStr::from_bytes(&read.stdout), word, "{script}");
+            assert!(!script.contains(is_unprintable), "{script:?}");
         }
     }
 }

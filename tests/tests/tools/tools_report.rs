@@ -1,4 +1,5 @@
-//! The page of `skinbus report` in a real browser: values under the pointer and at the keyboard's cursor.
+//! The page of `skinbus report` in a real browser: values under the pointer and at the keyboard's cursor, and commands to
+//! copy.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -63,6 +64,13 @@ fn values_of_figures_are_read_with_the_pointer_and_the_keyboard() {
     assert!(value(&mut browser, &text) > next);
     browser.key("keyDown", "Escape");
     browser.until(&format!("{} === null", reading("positions")));
+
+    // A command is copied as it is written, in one word for the file.
+    let code = value(&mut browser, "document.querySelector('code').textContent");
+    assert!(code.starts_with(r"skinbus view 'it'\''s a run.mcap' --at "), "{code}");
+    browser.value("document.querySelector('code + button').click()");
+    browser.until("['Copied', 'Selected'].includes(document.querySelector('code + button').textContent)");
+    assert_eq!(value(&mut browser, "String(getSelection())"), code);
 
     is_accessible(&mut browser);
     let outside: Vec<_> = browser.requests().into_iter().filter(|it| !it.starts_with(&url)).collect();

@@ -5,6 +5,7 @@ use std::fmt;
 use serde::Serialize;
 
 pub use super::finding::{Finding, FindingVerdict, Quantity};
+pub(crate) use super::number::with_minus_signs;
 pub use super::number::{format_number, format_quantity};
 pub use super::skin::{CellMap, CellStrip, ColourLegend, Drawing, LinkPanel, MapCell, StripGroup, StripRow};
 

@@ -31,7 +31,7 @@ pub(super) struct PrefixedUnit {
 pub(super) const MINUS: &str = "−";
 
 /// Returns the text of a number with true minus signs instead of hyphens.
-pub(super) fn with_minus_signs(number: &str) -> String {
+pub(crate) fn with_minus_signs(number: &str) -> String {
     number.replace('-', MINUS)
 }
 

@@ -1,4 +1,5 @@
-// Shows the values of a figure under the pointer, a finger, or the cursor of the keyboard. Without this script the page lacks only that.
+// Shows the values of a figure under the pointer, a finger, or the cursor of the keyboard, and copies commands. Without this script the
+// page lacks only that.
 (() => {
   const SVG = "http://www.w3.org/2000/svg", PREFIXES = ["p", "n", "µ", "m", "", "k", "M"], POWERS = "⁰¹²³⁴⁵⁶⁷⁸⁹";
   // A point this close to the pointer is read in both directions, in pixels; else only the time counts.
@@ -192,5 +193,19 @@
   }
   for (const [name, reader] of [["plots", plotReader], ["strip", stripReader], ["map", mapReader]]) {
     for (const svg of document.querySelectorAll(`svg[data-${name}]`)) listen(svg, reader);
+  }
+
+  for (const code of document.querySelectorAll("code")) {
+    const button = element("button", "Copy");
+    button.type = "button";
+    button.setAttribute("aria-label", `Copy ${code.textContent}`);
+    button.onclick = async () => {
+      getSelection().selectAllChildren(code);
+      let done = true;
+      try { await navigator.clipboard.writeText(code.textContent); } catch { done = document.execCommand("copy"); }
+      button.textContent = done ? "Copied" : "Selected";
+      setTimeout(() => { button.textContent = "Copy"; }, 1500);
+    };
+    code.after(" ", button);
   }
 })();

@@ -1,4 +1,5 @@
-//! Renders a page as one self-contained HTML file. It loads nothing; its script only shows values under the pointer.
+//! Renders a page as one self-contained HTML file. It loads nothing; its script only shows values under the pointer, and
+//! copies commands.
 
 use std::fmt::Write as _;
 
@@ -157,7 +158,8 @@ fn write_table(out: &mut String, table: &Table) {
     if !table.title.is_empty() {
         let _ = writeln!(out, "<h3>{}</h3>", escaped(&table.title));
     }
-    out.push_str("<div class=\"scroll\"><table>\n");
+    let class = if table.commands { " class=\"moments\"" } else { "" };
+    let _ = writeln!(out, "<div class=\"scroll\"><table{class}>");
     let columns = 0..table.head.len();
     let classes: Vec<_> = columns
         .map(|column| if is_number_column(table, column) { NUMBER_CLASS_ATTRIBUTE } else { "" })

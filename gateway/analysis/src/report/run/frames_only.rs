@@ -1,18 +1,20 @@
 //! Reports on captures with frames only, such as a candump log. The series come from the joints and torques on the
 //! buses, because the topics of the control loop are missing.
 
+use std::path::{Path, PathBuf};
+
 use protocol::skin::Skin;
 
 use super::bus_figures::{BusFigures, FrameEffect};
-use super::motion::TickSeries;
+use super::motion::{HALTED, RESUMED, TickSeries};
 
 /// A capture with frames only, as far as it has been read.
 #[derive(Debug)]
 pub(super) struct FramesOnlyCapture {
     /// Kind of the capture for use in a sentence, without article: `candump log`.
     pub(super) format: &'static str,
-    /// Name of the file of the skin.
-    pub(super) skin_file: String,
+    /// The file of the skin.
+    pub(super) skin_file: PathBuf,
     /// The bus whose joints determine the times of the series, as an index into the skin's buses.
     clock: Option<usize>,
     is_halted: bool,
@@ -23,7 +25,7 @@ pub(super) struct FramesOnlyCapture {
 }
 
 impl FramesOnlyCapture {
-    pub(super) fn new(is_log: bool, skin_file: &str) -> Self {
+    pub(super) fn new(is_log: bool, skin_file: &Path) -> Self {
         let format = if is_log { "candump log" } else { "MCAP file of another program" };
         let skin_file = skin_file.to_owned();
         Self { format, skin_file, clock: None, is_halted: false, end: 0.0, began: None }
@@ -57,7 +59,7 @@ impl FramesOnlyCapture {
             Some(FrameEffect::Halted(is_halted))
                 if std::mem::replace(&mut self.is_halted, is_halted) != is_halted =>
             {
-                motion.record_change(at, if is_halted { "halted" } else { "resumed" });
+                motion.record_change(at, if is_halted { HALTED } else { RESUMED });
             }
             Some(FrameEffect::Halted(_)) | None => {}
         }
@@ -115,7 +117,7 @@ mod tests {
     fn halts_are_turns_and_a_repeated_one_is_none() {
         let skin = model::testing::one_cell_skin();
         let mut motion = TickSeries::new(6);
-        let mut frames_only = FramesOnlyCapture::new(true, "skin.toml");
+        let mut frames_only = FramesOnlyCapture::new(true, Path::new("skin.toml"));
         for (at, is_halted) in [(1.0, true), (1.1, true), (2.0, false), (3.0, false)] {
             frames_only.receive_frame(
                 (at, 0, Some(FrameEffect::Halted(is_halted))),
@@ -125,6 +127,7 @@ mod tests {
         }
         frames_only.finish(&mut motion);
         assert_eq!(motion.changes, [(1.0, "halted"), (2.0, "resumed")]);
+        assert_eq!(motion.halts, (1, Some(1.0)));
         assert!((motion.duration_s() - 3.0).abs() < 1e-9);
         let missing = frames_only.missing_parts(&[], &motion);
         assert_eq!(missing.first(), Some(&"joints messages, and therefore no torques or replies"));

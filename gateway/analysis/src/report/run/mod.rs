@@ -18,7 +18,7 @@ mod motion;
 mod page;
 mod touched;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use protocol::skin::{Skin, SkinBus};
 use protocol::wire_time::BitRatesError;
@@ -127,8 +127,8 @@ pub struct ReportOptions {
     pub nominal: Option<u32>,
     /// Data bit rate of FD frames in bit/s, replacing the skin's.
     pub data: Option<u32>,
-    /// The skin of a capture with frames only, and the name of its file.
-    pub skin: Option<(String, Skin)>,
+    /// The skin of a capture with frames only, and its file.
+    pub skin: Option<(PathBuf, Skin)>,
 }
 
 impl ReportOptions {
@@ -211,7 +211,7 @@ fn read_recording(
     let begun = RunData::from_extras(&name, bytes.unwrap_or(0), (items.format(), items.extras()), options);
     while begun.is_err() && items.extras().skin().is_none() && items.next_item()?.is_some() {}
     let mut run = begun?;
-    run.files = paths.iter().map(|path| path.display().to_string()).collect();
+    run.files = paths.to_vec();
     let damaged = loop {
         match items.next_item() {
             Ok(Some(item)) => run.receive_item(&item),
@@ -267,8 +267,8 @@ struct RunData {
     metadata: Vec<(String, Vec<(String, String)>)>,
     /// The topics of joints and of torques.
     topics: [String; 2],
-    /// Names of the recording's files, in the given order.
-    files: Vec<String>,
+    /// The recording's files, in the given order.
+    files: Vec<PathBuf>,
     /// Time of the first message, in ns since 1970.
     began: Option<u64>,
     /// Time that counts as 0 s in commands, in s after the first message: the first tick of the run, or else the first
@@ -302,7 +302,7 @@ impl RunData {
         let has_skin = options.skin.is_some();
         let foreign = |what: String| ReportError::Foreign { name: name.to_owned(), what, has_skin };
         let recorded = extras.skin();
-        let skin_file = options.skin.as_ref().map_or("", |(file, _)| file);
+        let skin_file = options.skin.as_ref().map_or(Path::new(""), |(file, _)| file);
         let is_log = format == CaptureFormat::Candump;
         let frames_only = recorded.is_none().then(|| FramesOnlyCapture::new(is_log, skin_file));
         let Some(skin) = recorded.or_else(|| options.skin.clone().map(|(_, skin)| Ok(skin))) else {

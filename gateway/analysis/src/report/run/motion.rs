@@ -5,6 +5,9 @@ use protocol::quantiles::TimeHistogram;
 use trace::ros2::read::{Joints, Torques};
 use trace::ros2::skin::LoopTiming;
 
+/// Names of the changes between a halted robot and one that moves.
+pub(super) const HALTED: &str = "halted";
+pub(super) const RESUMED: &str = "resumed";
 /// Maximum number of changes of the control loop's state that are listed.
 const MAX_LISTED_CHANGES: usize = 12;
 
@@ -32,6 +35,8 @@ pub(super) struct TickSeries {
     pub(super) skip: Option<(f64, u64)>,
     /// Changes of the control loop's state, with their times in s.
     pub(super) changes: Vec<(f64, &'static str)>,
+    /// Number of halts, and the time of the first one in s.
+    pub(super) halts: (u64, Option<f64>),
     number: Option<u64>,
     comparing: Option<bool>,
     halt: u8,
@@ -114,11 +119,14 @@ impl TickSeries {
         }
         if timing.halted != self.halt {
             self.halt = timing.halted;
-            self.record_change(at, if timing.halted == 0 { "resumed" } else { "halted" });
+            self.record_change(at, if timing.halted == 0 { RESUMED } else { HALTED });
         }
     }
 
     pub(super) fn record_change(&mut self, at: f64, what: &'static str) {
+        if what == HALTED {
+            self.halts = (self.halts.0 + 1, self.halts.1.or(Some(at)));
+        }
         if self.changes.len() < MAX_LISTED_CHANGES {
             self.changes.push((at, what));
         }

@@ -179,6 +179,7 @@ impl PageDraft<'_> {
         findings.push(
             Finding::new_unrated("number of cells", skin.cells.len() as f64).with_paper_value(PAPER_CELLS),
         );
+        findings.extend(self.first_touch_finding());
         if motion.duration_s() > 0.0 {
             let hertz = |count: u64, seconds: f64| (count.saturating_sub(1) as f64 / seconds, "Hz");
             if motion.counts.ticks > 0 {
@@ -211,6 +212,7 @@ impl PageDraft<'_> {
             let worst = self.worst_loss_command(|loss| loss.late + loss.missing);
             findings.push(finding.with_origin("skin: joint_broadcast_hz").with_command(worst));
         }
+        findings.push(self.halts_finding());
         findings.extend(self.range_findings());
         findings.extend(self.fit_findings());
         let uplink: UplinkCounts =

@@ -304,7 +304,7 @@ impl PageDraft<'_> {
         let mut section = Section::new("losses", "Losses")
             .with_paragraph("Rows of possible losses are always shown; other rows only when they are not 0.");
         section.text.extend(self.missing_sentence("the counts of skipped ticks and bad cycles"));
-        section.with_tables(self.loss_table()).with_tables([Table::new(
+        section.with_tables(self.halt_table()).with_tables(self.loss_table()).with_tables([Table::new(
             "All counts",
             ["what", "count"],
             rows,

@@ -13,7 +13,7 @@ pub(super) fn capture_facts(run: &RunData, command: &str) -> Vec<(String, String
     if let Some(frames_only) = &run.frames_only {
         let began = frames_only.began.map(format_utc).map(|began| ("first frame", began));
         let capture = ("capture", format!("{}, {}, {} bytes", run.name, frames_only.format, run.bytes));
-        let skin = ("skin", frames_only.skin_file.clone());
+        let skin = ("skin", frames_only.skin_file.display().to_string());
         let all =
             [Some(capture), Some(skin), began, Some(("command that made the report", command.to_owned()))];
         return all.into_iter().flatten().map(|(name, value)| (name.to_owned(), value)).collect();

@@ -1,10 +1,14 @@
 //! Tables of times in the recording at which something happened, each with the command that shows it.
 
+use std::path::Path;
+
 use model::table::Notice;
+use protocol::usage::shell_quoted_os;
 
 use super::super::moments::ListedLoss;
+use super::super::motion::{HALTED, RESUMED};
 use super::PageDraft;
-use crate::report::figure::{Table, format_quantity};
+use crate::report::figure::{Finding, Table, format_quantity, with_minus_signs};
 
 /// Maximum number of rows of a table of moments.
 const MAX_MOMENT_ROWS: usize = 25;
@@ -23,8 +27,8 @@ impl PageDraft<'_> {
     /// Returns the command that shows the recording around a time, given in s after its first message.
     pub(super) fn view_command(&self, at: f64) -> String {
         let seconds = (at - self.run.zero.unwrap_or(0.0)).max(0.0);
-        let files: Vec<_> = self.run.files.iter().map(|file| shell_quoted(file)).collect();
-        let skin = self.run.frames_only.as_ref().map(|it| format!(" --skin {}", shell_quoted(&it.skin_file)));
+        let files: Vec<_> = self.run.files.iter().map(|file| path_word(file)).collect();
+        let skin = self.run.frames_only.as_ref().map(|it| format!(" --skin {}", path_word(&it.skin_file)));
         format!("skinbus view {}{} --at {seconds:.3}", files.join(" "), skin.unwrap_or_default())
     }
 
@@ -53,6 +57,38 @@ impl PageDraft<'_> {
             }));
         }
         self.moment_table("Touches, grouped by link", all, further)
+    }
+
+    /// Creates the finding of the first touch of a cell, if there is one.
+    pub(super) fn first_touch_finding(&self) -> Option<Finding> {
+        let touches = self.run.bus_figures.iter().enumerate().flat_map(|(bus, bus_figures)| {
+            bus_figures.touched.touches.iter().map(move |touch| (bus, bus_figures, touch))
+        });
+        let (bus, bus_figures, touch) =
+            touches.min_by(|(.., one), (.., other)| one.seconds.0.total_cmp(&other.seconds.0))?;
+        let node = bus_figures.table.cells().get(*touch.cells.first()?)?.node;
+        let chain = self.run.skin.buses.get(bus).map_or(0, |bus| bus.chain);
+        let what = format!("first touch: {}, cell {node}", self.link_name((chain, touch.row), Some(bus)));
+        let command = self.view_command(touch.seconds.0);
+        Some(Finding::new_unrated(what, (touch.seconds.0 - self.zero, "s")).with_command(Some(command)))
+    }
+
+    /// Creates the finding on halts of the robot.
+    pub(super) fn halts_finding(&self) -> Finding {
+        let (halts, first) = self.run.motion.halts;
+        let finding = super::zero_required_finding("halts of the robot".to_owned(), halts);
+        finding.with_command(first.filter(|_| halts > 0).map(|at| self.view_command(at)))
+    }
+
+    /// Creates the table of halts, and of their ends.
+    pub(super) fn halt_table(&self) -> Option<Table> {
+        let changes = self.run.motion.changes.iter().filter(|(_, what)| [HALTED, RESUMED].contains(what));
+        let all = changes.map(|&(at, what)| WeightedMoment {
+            at,
+            weight: f64::INFINITY,
+            what: format!("the robot was {what}"),
+        });
+        self.moment_table("Halts", all.collect(), 0)
     }
 
     /// Creates the table of losses, and of cells that fell silent, came back or restarted.
@@ -105,7 +141,9 @@ impl PageDraft<'_> {
             title.to_owned()
         };
         let rows = all.into_iter().map(|WeightedMoment { at, what, .. }| {
-            vec![format!("{:.3}\u{a0}s", at - self.zero), what, self.view_command(at)]
+            // Adding 0 removes the sign of a zero.
+            let seconds = ((at - self.zero) * 1e3).round() / 1e3 + 0.0;
+            vec![with_minus_signs(&format!("{seconds:.3}\u{a0}s")), what, self.view_command(at)]
         });
         Some(Table::new(title, MOMENT_TABLE_HEAD, rows).with_commands())
     }
@@ -119,25 +157,28 @@ fn loss_text(loss: &ListedLoss) -> String {
     all.collect::<Vec<_>>().join(", ")
 }
 
-/// Quotes a word for a shell.
-fn shell_quoted(word: &str) -> String {
-    let is_plain = |letter: char| letter.is_ascii_alphanumeric() || "/._-+=:,@%".contains(letter);
-    if !word.is_empty() && word.chars().all(is_plain) {
-        return word.to_owned();
+/// Returns a path as a word for a shell that no program takes for an option.
+fn path_word(path: &Path) -> String {
+    match path.as_os_str().as_encoded_bytes().starts_with(b"-") {
+        true => shell_quoted_os(Path::new(".").join(path).as_os_str()),
+        false => shell_quoted_os(path.as_os_str()),
     }
-    format!("'{}'", word.replace('\'', r"'\''"))
 }
 
 #[cfg(test)]
 mod tests {
-    use super::shell_quoted;
+    use super::*;
 
     #[test]
-    fn names_of_files_are_one_word_for_a_shell() {
-        for (name, word) in
-            [("runs/a-1.mcap", "runs/a-1.mcap"), ("a b", "'a b'"), ("it's", r"'it'\''s'"), ("", "''")]
-        {
-            assert_eq!(shell_quoted(name), word);
+    fn names_of_files_are_one_word_for_a_shell_and_no_options() {
+        for (name, word) in [
+            ("runs/a-1.mcap", "runs/a-1.mcap"),
+            ("a b", "'a b'"),
+            ("it's", r"'it'\''s'"),
+            ("-j", "./-j"),
+            ("- a", "'./- a'"),
+        ] {
+            assert_eq!(path_word(Path::new(name)), word);
         }
     }
 }
