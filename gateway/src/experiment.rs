@@ -256,9 +256,10 @@ fn print_findings(page: &Page, report: &Path) -> Result<(), Failure> {
             let beside = beside.into_iter().flatten().collect::<Vec<_>>().join("; ");
             let verdict = match verdict {
                 FindingVerdict::Stated => String::new(),
-                FindingVerdict::Better | FindingVerdict::Same | FindingVerdict::Worse => {
-                    format!("  {verdict}")
-                }
+                FindingVerdict::Better
+                | FindingVerdict::Same
+                | FindingVerdict::Busy
+                | FindingVerdict::Worse => format!("  {verdict}"),
             };
             rows.add_row(what, ours, format!("{beside}{verdict}"));
         }

@@ -105,6 +105,15 @@ impl Finding {
         self.verdict = if kept { FindingVerdict::Better } else { FindingVerdict::Worse };
         self
     }
+
+    /// Turns a bad rating into a warning, because a busy or slow machine explains the value.
+    #[must_use]
+    pub fn or_busy_machine(mut self) -> Self {
+        if self.verdict == FindingVerdict::Worse {
+            self.verdict = FindingVerdict::Busy;
+        }
+        self
+    }
 }
 
 /// The result of a comparison with the paper or with a requirement.
@@ -114,6 +123,8 @@ pub enum FindingVerdict {
     Better,
     /// The value is within 5 % of the paper's.
     Same,
+    /// The value is worse than the paper's, or violates the requirement, and a busy or slow machine explains it.
+    Busy,
     /// The value is worse than the paper's, or violates the requirement.
     Worse,
     /// The value is stated without a rating.
@@ -142,6 +153,7 @@ impl fmt::Display for FindingVerdict {
         f.write_str(match self {
             Self::Better => "better",
             Self::Same => "the same",
+            Self::Busy => "busy machine",
             Self::Worse => "worse",
             Self::Stated => "",
         })

@@ -129,6 +129,8 @@ fn write_findings(out: &mut String, findings: &[Finding]) {
             (FindingVerdict::Better, None) => ("better", "✓ better"),
             (FindingVerdict::Better, Some(_)) => ("better", "✓ met"),
             (FindingVerdict::Same, _) => ("same", "= the same"),
+            (FindingVerdict::Busy, None) => ("busy", "△ slow machine"),
+            (FindingVerdict::Busy, Some(_)) => ("busy", "△ busy machine"),
             (FindingVerdict::Worse, None) => ("worse", "✗ worse"),
             (FindingVerdict::Worse, Some(_)) => ("worse", "✗ not met"),
             (FindingVerdict::Stated, _) => ("stated", ""),
@@ -275,6 +277,69 @@ mod tests {
             facts: vec![("command".to_owned(), "skinbus run 'a' > b".to_owned())],
             sections: vec![section("one"), section("two"), section("three")],
         }
+    }
+
+    /// Returns the relative luminance of a colour of the form `#rgb` or `#rrggbb`, by WCAG 2.
+    fn luminance(colour: &str) -> f64 {
+        let digits = colour.strip_prefix('#').unwrap();
+        let doubled: String = digits.chars().flat_map(|digit| [digit, digit]).collect();
+        let digits = if digits.len() == 3 { doubled.as_str() } else { digits };
+        let part = |at: usize| {
+            let part = f64::from(u8::from_str_radix(&digits[at..at + 2], 16).unwrap()) / 255.0;
+            if part <= 0.040_45 { part / 12.92 } else { ((part + 0.055) / 1.055).powf(2.4) }
+        };
+        0.2126 * part(0) + 0.7152 * part(2) + 0.0722 * part(4)
+    }
+
+    #[test]
+    fn every_colour_of_text_has_contrast_and_red_is_not_amber() {
+        let colours = |line: &str| -> Vec<(String, String)> {
+            let inside = line.split_once('{').unwrap().1.trim_end_matches('}');
+            let pairs = inside.split(';').map(|pair| pair.split_once(':').unwrap());
+            pairs.map(|(name, colour)| (name.to_owned(), colour.to_owned())).collect()
+        };
+        let schemes: Vec<_> =
+            PAGE_CSS.lines().filter(|line| line.starts_with(":root{")).map(colours).collect();
+        assert_eq!(schemes.len(), 2, "light and dark");
+        for (scheme, svg_texts) in schemes.iter().zip(svg::text_colours()) {
+            let of = |name: &str| scheme.iter().find(|(it, _)| it == name).unwrap().1.clone();
+            let texts = ["--ink", "--faint", "--link", "--good", "--warn", "--bad"].map(of);
+            for (ground, text) in ["--ground", "--panel"]
+                .map(of)
+                .iter()
+                .flat_map(|ground| texts.iter().chain(&svg_texts).map(move |text| (ground, text)))
+            {
+                let [dark, light] = {
+                    let mut both = [luminance(ground), luminance(text)];
+                    both.sort_by(f64::total_cmp);
+                    both
+                };
+                let contrast = (light + 0.05) / (dark + 0.05);
+                assert!(contrast >= 4.5, "{text} on {ground}: {contrast:.2}");
+            }
+            // Red has less green than blue or about as much; amber has clearly more.
+            let green_over_blue = |colour: &str| {
+                let part = |at: usize| i32::from(u8::from_str_radix(&colour[at..at + 2], 16).unwrap());
+                part(3) - part(5)
+            };
+            assert!(green_over_blue(&of("--bad")) < 16 && green_over_blue(&of("--warn")) > 60, "{scheme:?}");
+        }
+    }
+
+    #[test]
+    fn what_a_busy_machine_did_is_not_red() {
+        let section = |finding: Finding| Section::new("one", "One").with_findings([finding]);
+        let html = |finding| {
+            let page = Page { sections: vec![section(finding)], ..Page::default() };
+            page_html(&page).split_once("<tbody>").unwrap().1.to_owned()
+        };
+        let broken = || Finding::new_unrated("ticks skipped", 3.0).with_requirement("none", false);
+        assert!(html(broken()).contains("class=\"verdict worse\">✗ not met"));
+        assert!(html(broken().or_busy_machine()).contains("class=\"verdict busy\">△ busy machine"));
+        let slower = Finding::less_is_better("time", 1.0, (2.0, "µs")).or_busy_machine();
+        assert!(html(slower).contains("class=\"verdict busy\">△ slow machine"));
+        let met = Finding::new_unrated("ticks skipped", 0.0).with_requirement("none", true).or_busy_machine();
+        assert!(html(met).contains("class=\"verdict better\">✓ met"));
     }
 
     /// Returns all text of an element.

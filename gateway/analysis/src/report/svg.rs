@@ -10,6 +10,8 @@ mod reading;
 
 pub use cells::{draw_cells, draw_inline as inline_cells, strip_values};
 pub use palette::dark_css_rules;
+#[cfg(test)]
+pub(crate) use palette::text_colours;
 
 use plotters::chart::{ChartBuilder, ChartContext};
 use plotters::coord::Shift;

@@ -15,7 +15,7 @@ use super::touched::TouchHistory;
 use crate::fit::rates::ChosenRates;
 use crate::report::thin::{BinnedSums, ThinnedLine};
 use model::central::CentralComputation;
-use model::table::{BusTable, BusTotals, Replies};
+use model::table::{BusTable, BusTotals, CellState, Replies};
 use trace::capture::LatchedFrame;
 
 /// Interval in µs at which timeouts of cells are checked, as in the gateway's receiver.
@@ -279,6 +279,19 @@ impl BusFigures {
     /// Returns the counts of due and received replies over all epochs.
     pub(super) fn reply_counts(&self) -> Replies {
         self.table.reply_counts()
+    }
+
+    /// Returns the number of missing replies that neither arrived too late nor were skipped by late cells.
+    pub(super) fn lost_reply_count(&self) -> u64 {
+        if self.sums {
+            return self.reply_counts().missing;
+        }
+        let lost = |cell: &CellState| {
+            let (skipped, _) = cell.unanswered_joint_counts().unwrap_or_default();
+            let Replies { missing, in_doubt, too_late, .. } = cell.replies;
+            missing - missing.saturating_sub(in_doubt).min(too_late + skipped)
+        };
+        self.table.cells().iter().map(lost).sum()
     }
 
     /// Returns the number and the sum in Nm of the torque errors so far.

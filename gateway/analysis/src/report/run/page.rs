@@ -11,6 +11,7 @@ use super::RunData;
 use super::bus_figures::BusFigures;
 use super::frames_only::FramesOnlyCapture;
 use super::moments::ListedLoss;
+use crate::fit::verdict::FitVerdict;
 use crate::paper;
 use crate::report::figure::{
     Axis, Figure, Finding, MarkLine, Page, Section, Series, SeriesShape, format_number, format_quantity,
@@ -174,7 +175,7 @@ impl PageDraft<'_> {
                 skin.cells.len(),
                 format_number((active * 10.0).round() / 10.0)
             );
-            findings.push(Finding::less_is_better(what, law, (median, "µs")));
+            findings.push(Finding::less_is_better(what, law, (median, "µs")).or_busy_machine());
         }
         findings.push(
             Finding::new_unrated("number of cells", skin.cells.len() as f64).with_paper_value(PAPER_CELLS),
@@ -198,7 +199,8 @@ impl PageDraft<'_> {
             }
             if motion.counts.ticks > 0 {
                 let skipped = zero_required_finding("ticks skipped".to_owned(), motion.counts.skipped);
-                findings.push(skipped.with_command(motion.skip.map(|(at, _)| self.view_command(at))));
+                let at = motion.skip.map(|(at, _)| self.view_command(at));
+                findings.push(skipped.or_busy_machine().with_command(at));
             }
         }
         let accounts = self.run.bus_figures.iter().map(BusFigures::reply_counts);
@@ -209,6 +211,7 @@ impl PageDraft<'_> {
             let bar = format!("none after {}", format_quantity(period, "s"));
             let late = due - in_time;
             let finding = Finding::new_unrated(what, late as f64).with_requirement(bar, late == 0);
+            let finding = if self.are_losses_late_only() { finding.or_busy_machine() } else { finding };
             let worst = self.worst_loss_command(|loss| loss.late + loss.missing);
             findings.push(finding.with_origin("skin: joint_broadcast_hz").with_command(worst));
         }
@@ -255,6 +258,17 @@ impl PageDraft<'_> {
     fn missing_sentence(&self, what: &str) -> Option<String> {
         self.run.frames_only.as_ref()?;
         Some(format!("This capture does not contain {what}."))
+    }
+
+    /// Returns true if the replies that were not in time were late or skipped as on a busy machine, and no bus was too
+    /// slow for them.
+    fn are_losses_late_only(&self) -> bool {
+        let is_slow = |bus: &BusShadow| {
+            let verdict = bus.this_run.as_ref().map(|fit| fit.verdict);
+            bus.is_timed && matches!(verdict, Some(FitVerdict::Bandwidth | FitVerdict::Deadline))
+        };
+        let lost: u64 = self.run.bus_figures.iter().map(BusFigures::lost_reply_count).sum();
+        lost == 0 && !self.bus_shadows.iter().any(is_slow)
     }
 
     /// Returns the command that shows the loss with the highest count.

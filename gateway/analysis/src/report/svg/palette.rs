@@ -31,6 +31,17 @@ pub(super) fn series_colours() -> impl Iterator<Item = RGBColor> {
     COLOUR_CLASSES.iter().skip(3).cycle().map(|(colour, ..)| *colour)
 }
 
+/// Returns the colours of text, on paper and on a dark screen.
+#[cfg(test)]
+pub(crate) fn text_colours() -> [[String; 2]; 2] {
+    let texts = [TEXT_COLOUR, FAINT_TEXT_COLOUR];
+    let paper = texts.map(|RGBColor(r, g, b)| format!("#{r:02X}{g:02X}{b:02X}"));
+    let dark = texts.map(|text| {
+        COLOUR_CLASSES.iter().find(|(colour, ..)| *colour == text).map_or("", |(.., dark)| dark).to_owned()
+    });
+    [paper, dark]
+}
+
 /// Returns the CSS rules with the colours for dark screens.
 #[must_use]
 pub fn dark_css_rules() -> String {
