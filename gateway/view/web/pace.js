@@ -65,6 +65,8 @@ export class Painter {
     }
     clearTimeout(this.later);
     if (this.sharp || !pace.software) return;
+    // News may come more often than a busy machine draws, so this must not wait for a moment without any.
+    if (!still && !drew && performance.now() - this.stood >= STILL_MS) return this.paint(true);
     this.later = setTimeout(() => requestAnimationFrame(() => { if (!this.due) this.paint(true); }), Math.max(0, this.stood + STILL_MS - performance.now()));
   }
 }

@@ -124,6 +124,7 @@ export class Picture {
     this.wires = [];
     this.ground = this.buffer([[0, 3, 0], [1, 3, 12]], 24);
     this.arrows = this.buffer([[0, 3, 0], [1, 3, 12]], 4 * ARROW_FLOATS);
+    this.pointed = null;
     if (this.numbers) atlas(gl);
     this.ribbon = this.buffer([[0, 3, 0], [1, 2, 12]], FLOATS * 4);
     this.round = this.solids(cylinders(scene));
@@ -191,6 +192,10 @@ export class Picture {
 
   // Sets the arrows to draw.
   point(corners) {
+    // Snapshots of a robot at rest repeat its arrows; a picture that changes never becomes sharp.
+    const before = this.pointed;
+    if (before?.length === corners.length && corners.every((v, i) => v === before[i])) return;
+    this.pointed = corners;
     if (corners.length || this.arrows.count) this.fill(this.arrows, corners, ARROW_FLOATS);
   }
 

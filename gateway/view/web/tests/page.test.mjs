@@ -10,6 +10,7 @@ import { axes as axesSeen, ground, spacing } from "../ground.js";
 import { haltedWords } from "../halted.js";
 import { Health } from "../health.js";
 import { cross, direction, dot, look, perspective, point, project, row, times, unit } from "../math.js";
+import { Picture } from "../picture.js";
 import { Pace, Painter, SOFTWARE_HZ, STILL_MS } from "../pace.js";
 import { axes, cylinders, facing, frames, neighbors, outline, placed, triangles } from "../robot.js";
 import { cellOf, decode, decodeHistory } from "../snapshot.js";
@@ -256,6 +257,12 @@ test("a zoom keeps what is under the pointer, a drag moves it, and a cell is fac
   assert.ok(Math.abs(share - 0.84) < 1e-6 && outside < 0);
 });
 
+test("arrows that a snapshot repeats do not change the picture", () => {
+  const filled = [], picture = Object.assign(Object.create(Picture.prototype), { arrows: { count: 0 }, fill: (_, corners) => filled.push(corners[0]) });
+  for (const x of [1, 1, 2, 2, 1]) picture.point(new Float32Array([x, 0, 0]));
+  assert.deepEqual(filled, [1, 2, 1]);
+});
+
 test("arrows show contact forces and torques about the joints' axes, and gaps in them late replies", () => {
   const { scene: of, at } = demo, all = frames(of, at[0]);
   const it = { ...of, cells: [1, 2, 3].map((node) => ({ bus: 0, node, row: 2, joint: 2, position: [0, 0, 0.07], normal: [0, 0, 1], neighbors: [], root: false })) };
@@ -373,6 +380,23 @@ test("a picture that is about to change is not drawn in full resolution, one tha
   painter.redraw();
   for (let k = 0; k < 3; k++) t.mock.timers.tick(STILL_MS);
   assert.deepEqual(drawn, [1, 1, 2], "news without a change do not keep it coarse");
+  [globalThis.requestAnimationFrame, globalThis.window] = keep;
+});
+
+test("a picture that stands still becomes sharp, however often news come", (t) => {
+  t.mock.timers.enable({ apis: ["setTimeout"] });
+  let now = 0;
+  const keep = [globalThis.requestAnimationFrame, globalThis.window], drawn = [];
+  t.mock.method(performance, "now", () => now);
+  [globalThis.requestAnimationFrame, globalThis.window] = [(then) => setTimeout(then, 150), { devicePixelRatio: 1 }];
+  let changed = true;
+  const painter = new Painter(true, (ratio) => { const drew = changed || ratio === 2; if (drew) drawn.push(ratio); changed = false; return { drew, worked: true }; });
+  for (let k = 0; k < 40; k++) {
+    painter.redraw();
+    now += 50;
+    t.mock.timers.tick(50);
+  }
+  assert.deepEqual(drawn.slice(0, 2), [1, 2]);
   [globalThis.requestAnimationFrame, globalThis.window] = keep;
 });
 
