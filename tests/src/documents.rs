@@ -98,7 +98,13 @@ fn targets(text: &str) -> Vec<String> {
         let links = outside_code.split(mark).skip(1);
         links.map(|rest| rest.split(end).next().unwrap().to_owned()).collect()
     };
-    [after("](", [')', ' ']), after("src=\"", ['"', '"']), after("href=\"", ['"', '"'])].concat()
+    [
+        after("](", [')', ' ']),
+        after("src=\"", ['"', '"']),
+        after("srcset=\"", ['"', '"']),
+        after("href=\"", ['"', '"']),
+    ]
+    .concat()
 }
 
 #[test]
