@@ -63,6 +63,8 @@ pub(crate) fn still_page(file: &Path, skin: &Skin, packages: &PackageOptions) ->
         positions: skin.robot.joints.iter().map(|joint| position(joint.limits)).collect(),
         details: skin.cells.iter().map(|cell| details(skin, cell)).collect(),
         moved: Vec::new(),
+        shades: None,
+        findings: Vec::new(),
     }
 }
 

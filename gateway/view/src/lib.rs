@@ -45,7 +45,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 pub use live::LiveState;
 pub use scene::Scene;
-pub use still::{PreviousCellPlace, StaticSkinPage};
+pub use still::{CellShades, FindingPart, PreviousCellPlace, StaticSkinPage};
 pub use surface::RowMesh;
 pub use token::Token;
 

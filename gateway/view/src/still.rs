@@ -25,6 +25,50 @@ pub struct StaticSkinPage {
     pub details: Vec<Vec<(String, String)>>,
     /// Cells that were at another place before. The page draws a line from the old place to the new one.
     pub moved: Vec<PreviousCellPlace>,
+    /// A value of each cell, which gives its colour; `None` to colour cells by bus.
+    pub shades: Option<CellShades>,
+    /// The results that the page shows at its top, in parts.
+    pub findings: Vec<FindingPart>,
+}
+
+/// A value of each cell, which gives its colour.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct CellShades {
+    /// The name of the value.
+    pub caption: String,
+    /// The unit of the value.
+    pub unit: String,
+    /// The value from which on cells have the last colour.
+    pub high: f64,
+    /// True if a value is larger than `high`.
+    pub more: bool,
+    /// The values in the order of [`Scene::cells`]; `None` for a cell without colour.
+    pub values: Vec<Option<f64>>,
+    /// The meaning of a cell without colour.
+    pub unknown: String,
+}
+
+/// A part of a sentence.
+#[derive(Clone, Debug, Eq, PartialEq, Serialize)]
+pub struct FindingPart {
+    /// The text.
+    pub text: String,
+    /// True if the text is the name of a cell, `bus:node`, to which the page links.
+    #[serde(rename = "isCell")]
+    pub is_cell: bool,
+}
+
+impl FindingPart {
+    /// Creates a part that is plain text.
+    pub fn text(text: impl Into<String>) -> Self {
+        Self { text: text.into(), is_cell: false }
+    }
+
+    /// Creates a part that names a cell.
+    #[must_use]
+    pub fn cell(bus: &str, node: u8) -> Self {
+        Self { text: format!("{bus}:{node}"), is_cell: true }
+    }
 }
 
 /// The place at which a cell was before.
@@ -49,6 +93,8 @@ struct StaticPageData<'a> {
     positions: &'a [f64],
     details: &'a [Vec<(String, String)>],
     moved: &'a [PreviousCellPlace],
+    shades: Option<&'a CellShades>,
+    findings: &'a [FindingPart],
     /// The corners of the surface in base64, in the format of [`pack_meshes`].
     surface: String,
 }
@@ -63,6 +109,8 @@ impl StaticSkinPage {
             positions: &self.positions,
             details: &self.details,
             moved: &self.moved,
+            shades: self.shades.as_ref(),
+            findings: &self.findings,
             surface: BASE64.encode(&corners),
         };
         // Serialising strings and numbers cannot fail. `<` is escaped, so that the data cannot end the script element.
@@ -101,6 +149,8 @@ mod tests {
             positions: vec![0.0; scene.joints.len()],
             moved: vec![PreviousCellPlace { cell: 7, chain: 0, row: 2, position, normal }],
             surface: vec![RowMesh { chain: 0, row: 1, triangles }],
+            shades: None,
+            findings: vec![FindingPart::text("</script>"), FindingPart::cell("vcan0", 7)],
             scene,
             details,
         }
@@ -120,6 +170,8 @@ mod tests {
             (&false.into(), &3.into())
         );
         assert_eq!(data["details"][9], serde_json::json!([["a<b", "</script><b>"]]));
+        assert_eq!(data["findings"][0], serde_json::json!({ "text": "</script>", "isCell": false }));
+        assert_eq!(data["findings"][1], serde_json::json!({ "text": "vcan0:7", "isCell": true }));
         assert_eq!(data["moved"][0]["position"], serde_json::json!([0.0, 0.1, 0.2]));
         assert_eq!(data["surface"].as_str().unwrap().len(), 3 * 24 / 3 * 4);
     }

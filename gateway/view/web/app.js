@@ -3,12 +3,12 @@
 import { arrows, axesOf, roundUp } from "./arrows.js";
 import { Bench, nameOf } from "./bench.js";
 import { AHEAD_S, Camera } from "./camera.js";
-import { SHOWS, css, isDark, onScheme, ramp, shapeOf } from "./colours.js";
+import { SHOWS, css, isDark, onScheme, shapeOf } from "./colours.js";
 import { haltReason } from "./halted.js";
 import { hold } from "./frames.js";
 import { axes as axesSeen } from "./ground.js";
 import { Health } from "./health.js";
-import { shapes } from "./legend.js";
+import { drawRamp, shapes } from "./legend.js";
 import { Link } from "./link.js";
 import { direction, point, project } from "./math.js";
 import { Painter } from "./pace.js";
@@ -314,13 +314,9 @@ function legend() {
   $("scale").hidden = shows.isBus ?? false;
   $("bus-colours").hidden = !shows.isBus;
   if (shows.isBus) return redraw();
-  const pen = $("ramp").getContext("2d"), { width, height } = $("ramp");
   $("low").textContent = number(shows.low).replace(/\.0+$/, "");
   $("high").textContent = `${number(shows.high).replace(/\.0+$/, "")} ${shows.unit}`;
-  for (let x = 0; x < width; x++) {
-    pen.fillStyle = `rgb(${ramp(x / (width - 1), isDark()).join(" ")})`;
-    pen.fillRect(x, 0, 1, height);
-  }
+  drawRamp($("ramp"));
   redraw();
 }
 $("shows").onchange = legend;

@@ -32,7 +32,7 @@ export const SHOWS = {
 // The colour of a cell, which is `at` in the scene; null at rest, and if the cell is silent.
 export function colourOf(shows, cell, at, dark = true) {
   if (shows.isBus) return busColour(at.bus);
-  const value = shows.of(cell);
+  const value = shows.of(cell, at);
   return cell.status === DEAD || shows.rest(value) ? null : ramp((value - shows.low) / (shows.high - shows.low), dark);
 }
 

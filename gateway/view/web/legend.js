@@ -1,7 +1,16 @@
 // Keys of what the picture shows: the colours of buses, and the shapes of cells.
 
-import { SHAPES, busColour } from "./colours.js";
+import { SHAPES, busColour, isDark, ramp } from "./colours.js";
 import { element } from "./dom.js";
+
+// Draws the colours of values from low to high.
+export function drawRamp(canvas) {
+  const pen = canvas.getContext("2d"), { width, height } = canvas;
+  for (let x = 0; x < width; x++) {
+    pen.fillStyle = `rgb(${ramp(x / (width - 1), isDark()).join(" ")})`;
+    pen.fillRect(x, 0, 1, height);
+  }
+}
 
 // A square of a bus' colour.
 export function busKey(bus) {

@@ -3,20 +3,24 @@
 import { Camera } from "./camera.js";
 import { SHOWS, css, onScheme } from "./colours.js";
 import { element, table } from "./dom.js";
-import { busKey, shapes } from "./legend.js";
+import { busKey, drawRamp, shapes } from "./legend.js";
 import { direction, point, project } from "./math.js";
 import { Painter } from "./pace.js";
 import { Picture } from "./picture.js";
 import { frames, indices, outline, placed } from "./robot.js";
+import { number } from "./scale.js";
 import { resting } from "./snapshot.js";
 import { listen, pick } from "./touch.js";
 import { MOVED, wired } from "./wires.js";
 
 const $ = (id) => document.getElementById(id);
-const { scene, positions, details, moved, surface } = JSON.parse($("skin").textContent);
+const { scene, positions, details, moved, surface, shades, findings } = JSON.parse($("skin").textContent);
 const canvas = $("picture"), camera = new Camera(), { cells } = scene, at = indices(scene);
 // The robot does not move, and the cells have no values.
 const all = frames(scene, positions), words = resting(cells.length), wires = wired(scene);
+// Cells have the colour of a value, if the page has one, or of their bus.
+const order = new Map(cells.map((cell, i) => [cell, i]));
+const shows = shades ? { of: (_, cell) => shades.values[order.get(cell)], low: 0, high: shades.high, rest: (v) => v === null } : SHOWS.bus;
 // The minimum radius on the screen of a cell that the camera faces, in pixels.
 const FACED = 24;
 let picture = null, chosen = -1;
@@ -49,7 +53,7 @@ const painter = new Painter(picture?.software ?? false, (ratio) => {
     camera.closest = Math.min(camera.closest, scene.pitch / camera.size);
     picture?.lay(camera.size, Math.min(0, pose.reduce((low, v, i) => (i % 3 === 2 ? Math.min(low, v) : low), Infinity)));
   }
-  picture?.update(words, SHOWS.bus, chosen);
+  picture?.update(words, shows, chosen);
   const drew = picture?.draw(view(), all, ratio) ?? false;
   if (drew) window.skinbus.frames++;
   return { drew, worked: false };
@@ -153,11 +157,29 @@ const count = (number, word, many = `${word}s`) => `${number} ${number === 1 ? w
 $("sum").textContent = [count(cells.length, "cell"), count(scene.buses.length, "bus", "buses"), count(wires.length, "wire")].join(", ");
 $("buses").replaceChildren(...scene.buses.map((bus, index) => {
   const item = element("li"), own = cells.filter((cell) => cell.bus === index), roots = own.filter((cell) => cell.root).length;
-  item.append(busKey(index), element("span", `${bus.name}: ${count(own.length, "cell")}, ${count(roots, "root")}`));
+  item.append(...(shades ? [] : [busKey(index)]), element("span", `${bus.name}: ${count(own.length, "cell")}, ${count(roots, "root")}`));
   return item;
 }));
-const marks = [{ name: "root", mark: "root" }, { name: "other cell", mark: "" }];
+const marks = [{ name: "root", mark: "root" }, { name: shades ? shades.unknown : "other cell", mark: "" }];
 if (moved.length) marks.push({ name: "moved from its place in the skin", mark: "way" });
-shapes($("shapes"), css, marks);
-onScheme(() => { picture?.colours(); shapes($("shapes"), css, marks); redraw(); });
+// What a page has found out, with cells as links to them.
+$("findings").hidden = !findings.length;
+$("findings").append(...findings.map(({ text, isCell }) => {
+  if (!isCell) return text;
+  const link = element("a", text);
+  link.href = `#${encodeURIComponent(text)}`;
+  return link;
+}));
+if (shades) {
+  $("shades").hidden = false;
+  $("shades-title").textContent = shades.caption;
+  $("low").textContent = "0";
+  $("high").textContent = `${shades.more ? "≥ " : ""}${number(shades.high)} ${shades.unit}`;
+}
+function legend() {
+  shapes($("shapes"), css, marks);
+  if (shades) drawRamp($("ramp"));
+}
+legend();
+onScheme(() => { picture?.colours(); legend(); redraw(); });
 follow();

@@ -59,7 +59,9 @@ fn a_calibration_finds_cells_and_its_recording_finds_the_same() {
         assert!(result["moved_mm"].as_f64().unwrap() < 15.0, "{result}");
         assert!(result["turned_deg"].as_f64().unwrap() < 3.0, "{result}");
     }
-    assert!(place.read("found.html").contains("calibrated"));
+    let page = place.read("found.html");
+    assert!(page.contains("calibrated") && page.contains("of 6 cells moved by more than their uncertainty"));
+    assert!(page.contains(r#""caption":"Distance from the skin's place","unit":"mm""#));
     place.is_left_clean();
 }
 
