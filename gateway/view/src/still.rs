@@ -177,6 +177,13 @@ mod tests {
     }
 
     #[test]
+    fn the_page_has_the_colours_of_the_live_page_once() {
+        let page = still().to_html();
+        assert_eq!(page.matches("const STOPS = [[68, 1, 84]").count(), 1);
+        assert_eq!(page.matches("const BUSES = [[86, 180, 233]").count(), 1);
+    }
+
+    #[test]
     fn the_page_asks_for_nothing_outside() {
         let page = still().to_html();
         assert!(!page.contains("http:") && !page.contains("https:") && !page.contains("import "));
