@@ -196,15 +196,16 @@
   }
 
   for (const code of document.querySelectorAll("code")) {
-    const button = element("button", "Copy");
+    const button = element("button");
+    const say = (word) => { button.textContent = word; button.setAttribute("aria-label", `${word}: ${code.textContent}`); };
     button.type = "button";
-    button.setAttribute("aria-label", `Copy ${code.textContent}`);
+    say("Copy");
     button.onclick = async () => {
       getSelection().selectAllChildren(code);
       let done = true;
       try { await navigator.clipboard.writeText(code.textContent); } catch { done = document.execCommand("copy"); }
-      button.textContent = done ? "Copied" : "Selected";
-      setTimeout(() => { button.textContent = "Copy"; }, 1500);
+      say(done ? "Copied" : "Selected");
+      setTimeout(() => say("Copy"), 1500);
     };
     code.after(" ", button);
   }

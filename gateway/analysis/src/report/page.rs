@@ -114,7 +114,8 @@ fn write_findings(out: &mut String, findings: &[Finding]) {
     let paper = findings.iter().any(|finding| finding.paper.is_some());
     let limit = findings.iter().any(|finding| finding.bar.is_some() || finding.against.is_some());
     let shown = [true, paper, true, limit, paper || limit];
-    out.push_str("<div class=\"scroll\"><table class=\"findings\">\n<thead>");
+    // A table that is wider than the screen can be scrolled with the keyboard.
+    out.push_str("<div class=\"scroll\" tabindex=\"0\"><table class=\"findings\">\n<thead>");
     let head = [
         ("quantity", ""),
         ("paper", NUMBER_CLASS_ATTRIBUTE),
@@ -161,7 +162,7 @@ fn write_table(out: &mut String, table: &Table) {
         let _ = writeln!(out, "<h3>{}</h3>", escaped(&table.title));
     }
     let class = if table.commands { " class=\"moments\"" } else { "" };
-    let _ = writeln!(out, "<div class=\"scroll\"><table{class}>");
+    let _ = writeln!(out, "<div class=\"scroll\" tabindex=\"0\"><table{class}>");
     let columns = 0..table.head.len();
     let classes: Vec<_> = columns
         .map(|column| if is_number_column(table, column) { NUMBER_CLASS_ATTRIBUTE } else { "" })
