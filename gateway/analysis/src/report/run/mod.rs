@@ -302,7 +302,7 @@ impl RunData {
         let has_skin = options.skin.is_some();
         let foreign = |what: String| ReportError::Foreign { name: name.to_owned(), what, has_skin };
         let recorded = extras.skin();
-        let skin_file = options.skin.as_ref().map_or(Path::new(""), |(file, _)| file);
+        let skin_file = options.skin.as_ref().map_or_else(|| Path::new(""), |(file, _)| file.as_path());
         let is_log = format == CaptureFormat::Candump;
         let frames_only = recorded.is_none().then(|| FramesOnlyCapture::new(is_log, skin_file));
         let Some(skin) = recorded.or_else(|| options.skin.clone().map(|(_, skin)| Ok(skin))) else {
