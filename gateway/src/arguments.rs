@@ -67,8 +67,8 @@ pub(crate) struct BusKinds {
 /// The option for the time that frames take on embedded buses.
 #[derive(Args, Clone, Copy, Debug)]
 pub(crate) struct BusTimeOption {
-    /// Let frames take time on embedded buses, as on a real bus with the skin's bit rates (else 1M/5M): none, real, or
-    /// real with the transmit queue of each program, such as real:fifo:10 [default: as the skin says, else none]
+    /// Time that a frame takes on embedded buses: none; real, as on a real bus with the skin's bit rates (without rates:
+    /// 1M/5M); or real with another transmit queue, such as real:fifo:10 [default: as the skin says, else none]
     #[arg(long, value_name = "TIME")]
     bus_time: Option<BusTimeChoice>,
 }

@@ -49,37 +49,37 @@ pub(crate) struct FitCommand {
     /// Bit rate of the data in CAN FD frames with bit-rate switch
     #[arg(long, value_name = "RATE", value_parser = parse_bit_rate)]
     data: Option<u32>,
-    /// With a skin: print a table for common bit rates instead of using the skin's rates
-    #[arg(long, conflicts_with = "nominal")]
+    /// Print a table for common bit rates instead of using the skin's rates
+    #[arg(help_heading = "Options for a skin", long, conflicts_with = "nominal")]
     table: bool,
-    /// With a skin: assume this frame format on all buses, instead of the skin's formats
-    #[arg(long, value_parser = one_of_values(FORMATS))]
+    /// Assume this frame format on all buses, instead of the skin's formats
+    #[arg(help_heading = "Options for a skin", long, value_parser = one_of_values(FORMATS))]
     format: Option<Format>,
-    /// With a skin: longest time in µs that a cell needs to compute its answer [the paper's cell: 68.5]
-    #[arg(long, value_name = "US", value_parser = parse_computation_ns)]
+    /// Longest time in µs that a cell needs to compute its answer [the paper's cell: 68.5]
+    #[arg(help_heading = "Options for a skin", long, value_name = "US", value_parser = parse_computation_ns)]
     computation: Option<u64>,
-    /// With traffic: assumed bit rates of a bus, such as can0=500k/2M or can1=1M; repeat the option for further buses
-    #[arg(long, value_name = "BUS=RATES", value_parser = rates_of_bus)]
+    /// Assumed bit rates of a bus, such as can0=500k/2M or can1=1M; repeat the option for further buses
+    #[arg(help_heading = "Options for traffic", long, value_name = "BUS=RATES", value_parser = rates_of_bus)]
     rates: Vec<(String, BitRates)>,
-    /// With traffic: skin file for bit rates and the worst case [default: the skin in the recording]
-    #[arg(long, value_name = "SKIN")]
+    /// Skin file that gives the bit rates and the worst case of its buses [default: the skin in the recording]
+    #[arg(help_heading = "Options for traffic", long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// With traffic: also count frames that only a test bench sends (stimuli, sync, report, their answers, simulated
+    /// Also count frames that only a test bench sends (stimuli, sync, report, their answers, simulated
     /// wires)
-    #[arg(long)]
+    #[arg(help_heading = "Options for traffic", long)]
     bench_traffic: bool,
-    /// With traffic: meaning of the time stamps of frames [default: request; end if the bus or the recording says so]
-    #[arg(long, value_enum, value_name = "MEANING")]
+    /// Meaning of the time stamps of frames [default: request; end if the bus or the recording says so]
+    #[arg(help_heading = "Options for traffic", long, value_enum, value_name = "MEANING")]
     time_stamps: Option<TimeStamps>,
-    /// With traffic: assumed bit error rate, 0 to 0.01 [default: 0]; each damaged frame causes an error frame and a
+    /// Assumed bit error rate, 0 to 0.01 [default: 0]; each damaged frame causes an error frame and a
     /// retransmission
-    #[arg(long, value_name = "SHARE", allow_negative_numbers = true)]
+    #[arg(help_heading = "Options for traffic", long, value_name = "SHARE", allow_negative_numbers = true)]
     ber: Option<f64>,
-    /// With traffic: random seed for bit errors [default: 1]
-    #[arg(long, value_name = "N", requires = "ber")]
+    /// Random seed for bit errors [default: 1]
+    #[arg(help_heading = "Options for traffic", long, value_name = "N", requires = "ber")]
     seed: Option<u64>,
-    /// With live buses: end the measurement after this time
-    #[arg(long, value_name = "TIME", value_parser = parse_duration, allow_negative_numbers = true)]
+    /// Time after which the measurement of live buses ends
+    #[arg(help_heading = "Options for traffic", long, value_name = "TIME", value_parser = parse_duration, allow_negative_numbers = true)]
     duration: Option<f64>,
     /// Print JSON instead of tables: one object for a skin, one for each frame of traffic
     ///

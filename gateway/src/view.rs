@@ -80,7 +80,7 @@ pub(crate) struct ViewCommand {
     /// ends; - for standard output
     #[arg(long, value_name = "FILE")]
     address_file: Option<PathBuf>,
-    /// Let pages only watch: they cannot press cells, halt or resume the robot
+    /// Let web pages only watch: they cannot press cells, halt or resume the robot
     #[arg(long)]
     read_only: bool,
     /// If a bus does not exist yet, wait for it instead of failing

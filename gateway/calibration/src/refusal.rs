@@ -126,8 +126,8 @@ pub enum Refusal {
     },
     /// Readings before and after a gap were not taken at the times of their joints.
     #[error(
-        "{bus}: from {at_s} s on, readings lag {ms} ms more behind their joints messages than elsewhere, so no pose \
-         is reliable; {disturbance}; record again with a control loop that skips no ticks"
+        "{bus}: from {at_s} s on, readings come {ms} ms later after their joints messages than before, so no pose is \
+         reliable; {disturbance}; record again with a control loop that skips no ticks"
     )]
     Shifted {
         /// The bus.

@@ -407,7 +407,7 @@ fn add_due_rows(
 /// Adds a row on the age of joints that cells have not received.
 fn add_joint_age_row(rows: &mut KeyValueTable, bus: &BusSummary) {
     let why = "large: a busy machine, or lost frames";
-    rows.add_row("age of joints missed by cells, µs", format_quantiles(&bus.joints_not_taken_us), why);
+    rows.add_row("age of joints that cells missed, µs", format_quantiles(&bus.joints_not_taken_us), why);
 }
 
 /// Converts a key of the summary to words.

@@ -54,7 +54,7 @@ function draw(ratio) {
   if (news) {
     said = null;
     words.link(stateOf({ connected: true, said: news }));
-    words.say(scene, news, ask, health);
+    words.say(scene, news, ask, health, hardest());
     bench.say(scene, news.bench, chosen);
     trees = news.buses.map((bus) => bus.tree);
     $("tree-switch").hidden = trees.every((tree) => !tree);
@@ -167,6 +167,17 @@ function press(i, turns = false) {
   if (pressed !== i) awaited = i;
   pressed = i;
   link.send({ do: "press", cell: name(i), force_n: Number($("force").value) });
+}
+
+// The cell that is pressed hardest, as text; empty if none is.
+function hardest() {
+  const { cells } = snapshot;
+  let at = -1, most = 0;
+  for (let i = 0; i < scene.cells.length; i++) {
+    const force = cells[2 * i] >>> 16;
+    if (force > most && cellOf(cells, i).status !== DEAD) [at, most] = [i, force];
+  }
+  return at < 0 ? "" : `${name(at)}, ${forceOf(at)}`;
 }
 
 const forceOf = (i) => { const { force, status } = cellOf(snapshot.cells, i); return status === DEAD ? "no force known" : `${(force / 1000).toFixed(1)} N`; };

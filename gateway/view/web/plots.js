@@ -106,8 +106,8 @@ export class Plots {
   push(snapshot) {
     const { time, joints, cells } = snapshot;
     this.now = isBack(time, this.now) ? time : Math.max(time, this.now);
-    // The last torques of a joint whose buses are down are none of now.
-    this.torques.add(time, joints.flatMap(({ distributed, central }, at) => (this.down.has(at) ? [NaN, NaN] : [distributed, central])));
+    // The last torques of a joint whose buses are down are none of now. Halted cells send none.
+    this.torques.add(time, joints.flatMap(({ distributed, central }, at) => (this.down.has(at) ? [NaN, NaN] : [this.halted ? NaN : distributed, central])));
     const forces = new Uint16Array(this.scene.cells.length);
     for (let i = 0; i < forces.length; i++) forces[i] = (cells[2 * i] & 255) === DEAD ? NO_FORCE : Math.min(NO_FORCE - 1, cells[2 * i] >>> 16);
     this.forces.add(time, forces);
@@ -117,7 +117,7 @@ export class Plots {
   // Takes in a status message, the reason of a halt, and the number of losses since the last one.
   say(said, why, lost) {
     const before = this.playback;
-    this.playback = said.playback;
+    [this.playback, this.halted] = [said.playback, said.halted];
     if (!this.playback) this.log.hear(said, why, lost);
     if (before?.jumped !== this.playback?.jumped) this.recorded.clear();
     this.loads.add(this.now, said.buses.map(({ load }) => (load ?? NaN) * 100));

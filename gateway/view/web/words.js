@@ -66,12 +66,13 @@ function many(buses, health) {
   return it;
 }
 
-export function say(scene, said, ask, health) {
+export function say(scene, said, ask, health, hardest) {
   const sum = (of) => said.buses.reduce((all, bus) => all + of(bus), 0);
   const [due, complete] = [sum((bus) => bus.epochs_due), sum((bus) => bus.epochs_complete)];
   facts([
     ["Cells", String(scene.cells.length)],
     ["In contact", String(said.contacts)],
+    ...(hardest ? [["Hardest", hardest]] : []),
     ["Silent", String(said.dead), said.dead ? "bad" : ""],
     ["Epochs complete", ...(due ? noted(health, said.buses.map((_, b) => `${b} incomplete`), `${complete} of ${due}`) : ["–"])],
   ]);
@@ -94,7 +95,7 @@ export function say(scene, said, ask, health) {
     ]),
   ]));
   show($("dead"), [said.dead_cells.length
-    ? table(said.dead_cells.map((cell) => [`${cell.bus}:${cell.node}`, `${cell.for_s.toFixed(0)} s`, "bad"]))
+    ? table(said.dead_cells.map((cell) => [`${cell.bus}:${cell.node}`, `for ${cell.for_s.toFixed(0)} s`, "bad"]))
     : element("p", "none", "faint")]);
   if (said.detail) detail(scene, said.detail, ask, health);
 }

@@ -160,7 +160,7 @@ pub enum PacketError {
     #[error("the other segments are missing")]
     Incomplete,
     /// Classic frames decode as packets of several lengths, although at most one of these was sent.
-    #[error("the CRC is correct for packets of several lengths")]
+    #[error("the length of the packet is ambiguous: the CRC is correct for several lengths")]
     Ambiguous,
 }
 

@@ -245,7 +245,7 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
         let reply = session.read_parameter(parameter.number())?;
         session.check("CONF-8", reply == Reply::Value(kept.words(parameter)), || {
             format!(
-                "after a restart parameter {} must read as it was committed, but it reads as {reply}",
+                "after a restart, parameter {} must have its committed value, but it reads as {reply}",
                 parameter.number()
             )
         });

@@ -285,8 +285,8 @@ fn check_pages_after_beats(session: &mut Session<'_>) -> Result<(), StopReason> 
         let all: Vec<_> = beats.iter().map(|pages| format_pages(pages)).collect();
         let count = beats.len();
         format!(
-            "in event mode, sensors page 0 must follow each heartbeat and all pages every fourth one, but \
-             these pages followed {count} heartbeats: {}",
+            "in event mode, sensors page 0 must follow each heartbeat, and all pages must follow every fourth \
+             heartbeat; {count} heartbeats were followed by these pages: {}",
             all.join(", ")
         )
     });
