@@ -302,7 +302,7 @@ fn add_reply_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) 
         rows.add_row(
             name,
             format_quantiles(&bus.last_reply_us),
-            last_reply_remark(bus, "by kernel time stamps"),
+            frames::last_reply_remark(bus, "by kernel time stamps"),
         );
         if bus.sums.is_none() {
             rows.add_row(
@@ -311,23 +311,14 @@ fn add_reply_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) 
                 "including late replies",
             );
         }
-        add_joint_age_row(rows, bus);
+        frames::add_joint_age_row(rows, bus);
     } else if bus.last_reply_us.count > 0 {
         let name = if bus.sums.is_some() { "last sum, µs" } else { "last reply, µs" };
         rows.add_row(
             name,
             format_quantiles(&bus.last_reply_us),
-            last_reply_remark(bus, "after the joints message"),
+            frames::last_reply_remark(bus, "after the joints message"),
         );
-    }
-}
-
-/// Returns the remark on the time of the last reply: its upper bound on a timed bus, and else this one.
-fn last_reply_remark(bus: &BusSummary, untimed: &str) -> String {
-    match (&bus.timed, bus.last_reply_bound_us) {
-        (None, _) => untimed.to_owned(),
-        (Some(_), Some(bound)) => format!("after the joints message; bound of fit {bound:.0}"),
-        (Some(_), None) => "after the joints message; fit has no bound".to_owned(),
     }
 }
 
@@ -402,12 +393,6 @@ fn add_due_rows(
     for (count, why) in reasons {
         rows.add_row("  not due", count, why);
     }
-}
-
-/// Adds a row on the age of joints that cells have not received.
-fn add_joint_age_row(rows: &mut KeyValueTable, bus: &BusSummary) {
-    let why = "large: a busy machine, or lost frames";
-    rows.add_row("age of joints that cells missed, µs", format_quantiles(&bus.joints_not_taken_us), why);
 }
 
 /// Converts a key of the summary to words.

@@ -2,7 +2,7 @@
 
 use bench::summary::BusSummary;
 
-use super::{add_unexplained_row, counts_by_kind, reasons_text};
+use super::{add_unexplained_row, counts_by_kind, format_quantiles, reasons_text};
 use crate::print::{KeyValueTable, comma_separated, count_with_noun};
 
 pub(super) fn add_frame_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
@@ -50,6 +50,21 @@ pub(super) fn add_timed_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verb
     }
     rows.add_row_unless_zero("  damaged frames", timed.damaged, "sent again");
     rows.add_row_unless_zero("  refused frames", timed.refused, "a transmit queue was full");
+}
+
+/// Returns the remark on the time of the last reply: its upper bound on a timed bus, and else this one.
+pub(super) fn last_reply_remark(bus: &BusSummary, untimed: &str) -> String {
+    match (&bus.timed, bus.last_reply_bound_us) {
+        (None, _) => untimed.to_owned(),
+        (Some(_), Some(bound)) => format!("after the joints message; bound of fit {bound:.0}"),
+        (Some(_), None) => "after the joints message; fit has no bound".to_owned(),
+    }
+}
+
+/// Adds a row on the age of joints that cells have not received.
+pub(super) fn add_joint_age_row(rows: &mut KeyValueTable, bus: &BusSummary) {
+    let why = "large: a busy machine, or lost frames";
+    rows.add_row("age of joints that cells missed, µs", format_quantiles(&bus.joints_not_taken_us), why);
 }
 
 /// Adds rows on the packets from the cells, by what became of them.
