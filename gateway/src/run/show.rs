@@ -409,7 +409,7 @@ fn counts_by_kind(kinds: impl IntoIterator<Item = (impl Display, impl Display)>)
 fn reasons_text(reasons: &[(u64, impl Display)], unknown: u64) -> String {
     let known = reasons.iter().filter(|(count, _)| *count > 0);
     let known = known.map(|(count, why)| format!("{count} {why}"));
-    comma_separated(known.chain([format!("{unknown} unknown")]))
+    comma_separated(known.chain([format!("{unknown} of unknown cause")]))
 }
 
 /// Adds rows on the measuring cells of a bus, and on its most conspicuous cells.

@@ -175,8 +175,11 @@ fn what_is_not_usual_is_shown_without_verbose() {
         ),
         (|it| it.buses[0].silent_cells = vec![7], "silent cells"),
         (|it| (it.buses[0].replies.in_time, it.buses[0].replies.late) = (17_771, 1), "1 late"),
-        (|it| (it.buses[0].replies.in_time, it.buses[0].replies.lost) = (17_771, 1), "1 lost, 0 unknown"),
-        (|it| it.buses[0].uplink.dropped = 1, "1 dropped by the bus, 0 unknown"),
+        (
+            |it| (it.buses[0].replies.in_time, it.buses[0].replies.lost) = (17_771, 1),
+            "1 lost, 0 of unknown cause",
+        ),
+        (|it| it.buses[0].uplink.dropped = 1, "1 dropped by the bus, 0 of unknown cause"),
         (|it| it.buses[0].uplink.restarts = 1, "restarts of cells"),
         (|it| it.buses[0].events = [("wrong CRC", 1)].into(), "1 wrong CRC"),
     ];
