@@ -17,6 +17,10 @@ use super::arguments::{BusKinds, FORMATS, one_of_values, parse_duration};
 use super::input::{is_file, read_skin};
 use super::print::comma_separated;
 
+/// Headings in the help of options that need the one or the other kind of source.
+const FOR_SKIN: &str = "Options for a skin";
+const FOR_TRAFFIC: &str = "Options for traffic";
+
 /// Compute whether a skin, or the traffic of a capture or a live bus, fits on real buses
 ///
 /// For a skin, computes the worst case: load, time from a joints message to the last answer, cells and buses, with the
@@ -50,36 +54,36 @@ pub(crate) struct FitCommand {
     #[arg(long, value_name = "RATE", value_parser = parse_bit_rate)]
     data: Option<u32>,
     /// Print a table for common bit rates instead of using the skin's rates
-    #[arg(help_heading = "Options for a skin", long, conflicts_with = "nominal")]
+    #[arg(help_heading = FOR_SKIN, long, conflicts_with = "nominal")]
     table: bool,
     /// Assume this frame format on all buses, instead of the skin's formats
-    #[arg(help_heading = "Options for a skin", long, value_parser = one_of_values(FORMATS))]
+    #[arg(help_heading = FOR_SKIN, long, value_parser = one_of_values(FORMATS))]
     format: Option<Format>,
     /// Longest time in µs that a cell needs to compute its answer [the paper's cell: 68.5]
-    #[arg(help_heading = "Options for a skin", long, value_name = "US", value_parser = parse_computation_ns)]
+    #[arg(help_heading = FOR_SKIN, long, value_name = "US", value_parser = parse_computation_ns)]
     computation: Option<u64>,
     /// Assumed bit rates of a bus, such as can0=500k/2M or can1=1M; repeat the option for further buses
-    #[arg(help_heading = "Options for traffic", long, value_name = "BUS=RATES", value_parser = rates_of_bus)]
+    #[arg(help_heading = FOR_TRAFFIC, long, value_name = "BUS=RATES", value_parser = rates_of_bus)]
     rates: Vec<(String, BitRates)>,
     /// Skin file that gives the bit rates and the worst case of its buses [default: the skin in the recording]
-    #[arg(help_heading = "Options for traffic", long, value_name = "SKIN")]
+    #[arg(help_heading = FOR_TRAFFIC, long, value_name = "SKIN")]
     skin: Option<PathBuf>,
     /// Also count frames that only a test bench sends (stimuli, sync, report, their answers, simulated
     /// wires)
-    #[arg(help_heading = "Options for traffic", long)]
+    #[arg(help_heading = FOR_TRAFFIC, long)]
     bench_traffic: bool,
     /// Meaning of the time stamps of frames [default: request; end if the bus or the recording says so]
-    #[arg(help_heading = "Options for traffic", long, value_enum, value_name = "MEANING")]
+    #[arg(help_heading = FOR_TRAFFIC, long, value_enum, value_name = "MEANING")]
     time_stamps: Option<TimeStamps>,
     /// Assumed bit error rate, 0 to 0.01 [default: 0]; each damaged frame causes an error frame and a
     /// retransmission
-    #[arg(help_heading = "Options for traffic", long, value_name = "SHARE", allow_negative_numbers = true)]
+    #[arg(help_heading = FOR_TRAFFIC, long, value_name = "SHARE", allow_negative_numbers = true)]
     ber: Option<f64>,
     /// Random seed for bit errors [default: 1]
-    #[arg(help_heading = "Options for traffic", long, value_name = "N", requires = "ber")]
+    #[arg(help_heading = FOR_TRAFFIC, long, value_name = "N", requires = "ber")]
     seed: Option<u64>,
     /// Time after which the measurement of live buses ends
-    #[arg(help_heading = "Options for traffic", long, value_name = "TIME", value_parser = parse_duration, allow_negative_numbers = true)]
+    #[arg(help_heading = FOR_TRAFFIC, long, value_name = "TIME", value_parser = parse_duration, allow_negative_numbers = true)]
     duration: Option<f64>,
     /// Print JSON instead of tables: one object for a skin, one for each frame of traffic
     ///

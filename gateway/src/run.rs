@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use analysis::fit::verdict::FitSummary;
-use analysis::fit::{assess_worst_case, last_reply_bound_ns};
+use analysis::fit::{assess_worst_case, last_reply_bound_us};
 use bench::bus::time::BusTimeChoice;
 use bench::emulate::EmulatedCells;
 use bench::processes::create_memory_file;
@@ -345,11 +345,8 @@ fn announce_bus_time(options: &mut RunOptions) {
 fn add_reply_bounds(summary: &mut Summary, skin: &Skin) {
     for bus in &mut summary.buses {
         let rates = bus.timed.as_ref().and_then(|timed| timed.rates.parse().ok());
-        let nanos = rates.zip(skin.bus_index(&bus.name));
-        let nanos = nanos.and_then(|(rates, index)| last_reply_bound_ns(skin, index, rates));
-        #[expect(clippy::cast_precision_loss, reason = "2^53 ns are 104 days")]
-        let micros = nanos.map(|nanos| nanos as f64 * 1e-3);
-        bus.last_reply_bound_us = micros;
+        let known = rates.zip(skin.bus_index(&bus.name));
+        bus.last_reply_bound_us = known.and_then(|(rates, index)| last_reply_bound_us(skin, index, rates));
     }
 }
 

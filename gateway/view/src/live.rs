@@ -153,7 +153,7 @@ impl LiveState {
     /// Returns for each bus the longest time in ms from joints to a reply to them, of the replies between the last two
     /// joints; `None` without a reply, and on a bus on which frames take no time.
     pub fn longest_reply_ms_by_bus(&self) -> impl Iterator<Item = Option<f64>> {
-        self.buses.iter().map(|bus| bus.reply_times()?.longest_of_epoch_ms())
+        self.buses.iter().map(|bus| bus.timed()?.replies.longest_of_epoch_ms())
     }
 
     /// Returns true if any bus is halted.
@@ -230,8 +230,8 @@ impl LiveState {
 
     /// Sets whether frames take time on a bus, so that their time stamps are their ends.
     pub fn set_bus_timed(&mut self, bus: usize, is_timed: bool) {
-        if let Some(bus) = self.buses.get_mut(bus) {
-            bus.set_timed(is_timed);
+        if let Some(of) = self.buses.get_mut(bus) {
+            of.set_timed(&self.skin, bus, is_timed);
         }
     }
 

@@ -89,7 +89,7 @@ export function say(scene, said, ask, health, hardest) {
       ["Replies in time", `${bus.in_time} of ${bus.due}`],
       ["Replies late, missing", ...noted(health, [`${b} late`, `${b} missing`], `${bus.late}, ${bus.missing}`)],
       ["Packets lost, damaged", ...noted(health, [`${b} lost`, `${b} rejected`], `${bus.lost}, ${bus.rejected}`)],
-      ...(bus.dropped ? [["  of these, missed by the page", ...noted(health, [`${b} dropped`], String(bus.dropped))]] : []),
+      ...(bus.dropped ? [["of these, missed by the page", ...noted(health, [`${b} dropped`], String(bus.dropped))]] : []),
       ["Saturated torques", ...noted(health, [`${b} saturated`], String(bus.saturated))],
       ["Mean error", bus.error_nm === null ? "–" : `${bus.error_nm.toExponential(1)} Nm`],
     ]),

@@ -7,7 +7,6 @@ use std::time::Duration;
 use clap::Args;
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use protocol::bus::BusKind;
-use protocol::bus::embedded::FiguresRequest;
 use protocol::usage::{Failure, print_text};
 use serde::Serialize;
 use vcan_setup::embedded::TimedReport;
@@ -100,12 +99,8 @@ fn query_link_reports<'a>(
 
 /// Returns the figures of the timed buses among these. A server that does not answer in time is left out.
 fn query_timed_figures(embedded: &[EmbeddedBus]) -> BTreeMap<&str, TimedReport> {
-    let figures = |bus: &EmbeddedBus| {
-        let answer = FiguresRequest::send(&bus.name, None).ok()?.receive(ANSWER_TIMEOUT)?;
-        TimedReport::from_json(&answer)
-    };
-    let served = embedded.iter().filter(|bus| bus.served);
-    served.filter_map(|bus| Some((bus.name.as_str(), figures(bus)?))).collect()
+    let names = embedded.iter().filter(|bus| bus.served).map(|bus| bus.name.as_str());
+    names.filter_map(|name| Some((name, TimedReport::request(name, None, ANSWER_TIMEOUT)?))).collect()
 }
 
 fn format_timed_figures(timed: &BTreeMap<&str, TimedReport>) -> String {

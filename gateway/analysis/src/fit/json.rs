@@ -85,6 +85,6 @@ impl Serialize for AssessedBus {
 
 /// Converts ns to µs.
 #[expect(clippy::cast_precision_loss, reason = "at most a minute")]
-fn nanos_to_micros(ns: u64) -> f64 {
+pub(super) fn nanos_to_micros(ns: u64) -> f64 {
     ns as f64 / 1e3
 }

@@ -159,11 +159,11 @@ pub fn assess_worst_case(skin: &Skin, index: usize, rates: BitRates) -> Option<A
     Some(AssessedBus::assess(&BusCase::from_skin(skin, index, format, rates, PAPER_COMPUTATION_NS)?))
 }
 
-/// Returns the upper bound of the time in ns from joints to their last reply on one bus of a skin at these rates, with all
+/// Returns the upper bound of the time in µs from joints to their last reply on one bus of a skin at these rates, with all
 /// cells answering; `None` without an upper bound.
 #[must_use]
-pub fn last_reply_bound_ns(skin: &Skin, index: usize, rates: BitRates) -> Option<u64> {
-    assess_worst_case(skin, index, rates)?.times.last_answer_ns()
+pub fn last_reply_bound_us(skin: &Skin, index: usize, rates: BitRates) -> Option<f64> {
+    assess_worst_case(skin, index, rates)?.times.last_answer_ns().map(json::nanos_to_micros)
 }
 
 /// The fit of all cells of a skin, if they are spread evenly over several buses.

@@ -1,4 +1,4 @@
-//! The figures of a timed bus, requested from its server, whoever serves it.
+//! The figures of a timed bus, requested again and again from its server, whoever serves it.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -6,8 +6,6 @@ use std::time::{Duration, Instant};
 use protocol::bus::embedded::FiguresRequest;
 use vcan_setup::embedded::TimedReport;
 
-/// Time that a server has to answer.
-const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
 /// Time between two requests of [`TimedFigures::poll`].
 const POLL_INTERVAL: Duration = Duration::from_secs(1);
 
@@ -27,14 +25,6 @@ impl TimedFigures {
     pub fn new(name: &str, directory: Option<&Path>) -> Self {
         let directory = directory.map(Path::to_owned);
         Self { name: name.to_owned(), directory, pending: None, requested: None }
-    }
-
-    /// Requests the present figures and waits for them. Returns `None` if the server does not answer, or if frames take no time
-    /// on its bus.
-    #[must_use]
-    pub fn request(&self) -> Option<TimedReport> {
-        let request = FiguresRequest::send(&self.name, self.directory.as_deref()).ok()?;
-        TimedReport::from_json(&request.receive(ANSWER_TIMEOUT)?)
     }
 
     /// Returns the figures of an answer that has come since the last call, and requests the next one a second after the last

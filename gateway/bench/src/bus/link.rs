@@ -13,9 +13,11 @@ use protocol::can::Frame;
 use vcan_setup::embedded::TimedReport;
 use vcan_setup::hosts::report::ReportReader;
 
-use super::figures::TimedFigures;
 use super::follow::BusSource;
 use control::cycle::turn::BusState;
+
+/// Time that the server of a timed bus has to report its figures.
+const FIGURES_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// A bus shared by the threads of a run.
 #[derive(Debug)]
@@ -82,11 +84,12 @@ impl SharedBus {
         ReportReader::connect(&self.name, self.kind, self.target.directory.as_deref())
     }
 
-    /// Returns the figures of a timed bus from its server; `None` if the server does not answer.
+    /// Returns the figures of a timed bus from its server; `None` if the server does not answer, or if frames take no time
+    /// on the bus.
     #[must_use]
     pub fn request_figures(&self) -> Option<TimedReport> {
-        let served = self.kind.served_name(&self.name);
-        TimedFigures::new(&served, self.target.directory.as_deref()).request()
+        let served = self.is_timed.then(|| self.kind.served_name(&self.name))?;
+        TimedReport::request(&served, self.target.directory.as_deref(), FIGURES_TIMEOUT)
     }
 
     /// Sends frames. Blocks while the receiver replaces the bus, so the control loop must not call it.

@@ -341,7 +341,7 @@ fn start_receiver(
     let receiver = Some(spawn(&format!("rx {}", link.name), move || receiver.run())?);
     let network = Network::for_bus(skin, index);
     let line = Some((line, slot));
-    let figures_before = if link.is_timed { link.request_figures() } else { None };
+    let figures_before = link.request_figures();
     Ok(RunBus {
         link,
         format,

@@ -302,7 +302,7 @@ fn check_tare_requests(session: &mut Session<'_>) -> Result<(), StopReason> {
             let is_so = is_near(zero.zero.to_bits().into(), expected, 2) && is_counted;
             session.check("BASE-6", is_so, || {
                 format!(
-                    "{what}, sensors page 3 must report the baseline {expected} and the number of refused tares, but \
+                    "{what}, sensors page 3 must report a zero offset of {expected} steps and the number of refused tares, but \
                      it reports {}",
                     format_baseline(zero)
                 )

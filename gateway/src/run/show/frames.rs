@@ -38,15 +38,17 @@ pub(super) fn add_timed_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verb
     let Some(timed) = &bus.timed else { return };
     let load = timed.load.map_or_else(|| "-".to_owned(), |load| format!("{:.1} %", load * 100.0));
     rows.add_row("  bus load", load, format!("of {}, transmit queues {}", timed.rates, timed.queue));
-    let [wait, delay] = [timed.wait_us, timed.delay_us]
-        .map(|it| format!("{:.0} / {:.0} / {:.0} / {:.0}", it.p50, it.p90, it.p99, it.max));
-    rows.add_row("  waiting and sending, µs", wait, "from a frame's request to its end");
+    rows.add_row(
+        "  waiting and sending, µs",
+        format_quantiles(&timed.wait_us),
+        "from a frame's request to its end",
+    );
     if is_verbose || timed.behind > 0 {
         let behind = format!(
             "from a frame's end to its delivery; {} over 1 ms",
             count_with_noun(timed.behind, "time")
         );
-        rows.add_row("  delivery, µs", delay, behind);
+        rows.add_row("  delivery, µs", format_quantiles(&timed.delay_us), behind);
     }
     rows.add_row_unless_zero("  damaged frames", timed.damaged, "sent again");
     rows.add_row_unless_zero("  refused frames", timed.refused, "a transmit queue was full");

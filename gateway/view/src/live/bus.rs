@@ -39,6 +39,16 @@ struct BusLoad {
     share: Option<f64>,
 }
 
+/// What only a bus has on which frames take time.
+#[derive(Clone, Debug)]
+pub(crate) struct TimedBus {
+    pub(crate) replies: ReplyTimes,
+    /// The upper bound of the time in µs from joints to their last reply; `None` without one.
+    pub(super) last_reply_bound_us: Option<f64>,
+    /// The last figures of the bus's server; `None` in a recording.
+    pub(super) figures: Option<TimedReport>,
+}
+
 #[derive(Clone, Debug)]
 pub(crate) struct LiveBus {
     pub(crate) name: String,
@@ -58,12 +68,8 @@ pub(crate) struct LiveBus {
     pub(crate) dead_since: Vec<Option<Micros>>,
     rates: Option<BitRates>,
     load: BusLoad,
-    /// The times of replies; `None` on a bus on which frames take no time.
-    replies: Option<Box<ReplyTimes>>,
-    /// The longest time in ns from joints to their last reply in the worst case, if it has a bound.
-    last_reply_bound_ns: Option<u64>,
-    /// The figures of the bus's server, if frames take time on the bus.
-    figures: Option<TimedReport>,
+    /// What only a bus has on which frames take time.
+    timed: Option<Box<TimedBus>>,
     pub(crate) halted: bool,
     pub(crate) is_up: bool,
     pub(crate) dropped: u64,
@@ -75,7 +81,6 @@ impl LiveBus {
         table.set_torque_comparison(true);
         let described = skin.buses.get(bus);
         let cells = table.cells().len();
-        let rates = described.and_then(|bus| Some(RequestedRates::default().for_bus(bus).ok()?.rates));
         Self {
             name: described.map(|bus| bus.name.clone()).unwrap_or_default(),
             central: CentralComputation::new(&skin.with_cells_of_bus(bus)),
@@ -87,11 +92,9 @@ impl LiveBus {
             joints: skin.joints_on_bus(bus).len(),
             last: vec![None; cells],
             dead_since: vec![None; cells],
-            rates,
+            rates: described.and_then(|bus| Some(RequestedRates::default().for_bus(bus).ok()?.rates)),
             load: BusLoad::default(),
-            replies: None,
-            figures: None,
-            last_reply_bound_ns: rates.and_then(|rates| fit::last_reply_bound_ns(skin, bus, rates)),
+            timed: None,
             halted: false,
             is_up: false,
             dropped: 0,
@@ -116,17 +119,17 @@ impl LiveBus {
                 self.close_epoch();
                 let heard = BroadcastJoints { epoch, positions: said.positions };
                 self.previous = self.current.replace(heard);
-                self.replies.iter_mut().for_each(|replies| replies.handle_joints(at, epoch));
+                self.timed.iter_mut().for_each(|timed| timed.replies.handle_joints(at, epoch));
             }
             Some(Message::Torque { from, epoch, torque }) => {
                 let place = self.table.index_of(from);
                 if let Some(last) = place.and_then(|place| self.last.get_mut(place)) {
                     *last = Some((at, epoch, torque));
                 }
-                self.replies.iter_mut().for_each(|replies| replies.handle_reply(at, epoch));
+                self.timed.iter_mut().for_each(|timed| timed.replies.handle_reply(at, epoch));
             }
             Some(Message::Sum { epoch, .. }) => {
-                self.replies.iter_mut().for_each(|replies| replies.handle_reply(at, epoch));
+                self.timed.iter_mut().for_each(|timed| timed.replies.handle_reply(at, epoch));
             }
             Some(Message::Halt) => self.halted = true,
             Some(Message::Resume) => self.halted = false,
@@ -164,7 +167,7 @@ impl LiveBus {
     /// Sets the time, by which cells become silent and the load is measured. Returns the notices since the last call.
     pub(crate) fn handle_time(&mut self, now: Micros) -> Vec<Notice> {
         self.table.handle_time(now);
-        self.replies.iter_mut().for_each(|replies| replies.handle_time(now));
+        self.timed.iter_mut().for_each(|timed| timed.replies.handle_time(now));
         let notices = self.table.drain_notices().collect();
         for ((_, status), since) in self.table.statuses(now).zip(&mut self.dead_since) {
             match status {
@@ -188,39 +191,39 @@ impl LiveBus {
         (self.is_up, self.dropped) = (is_up, dropped);
     }
 
-    /// Sets whether frames take time on the bus, so that their time stamps are their ends.
-    pub(crate) fn set_timed(&mut self, is_timed: bool) {
-        if is_timed != self.replies.is_some() {
-            self.replies = is_timed.then(Box::default);
-            self.figures = None;
+    /// Sets whether frames take time on the bus, so that their time stamps are their ends. `bus` is its index in the skin.
+    pub(crate) fn set_timed(&mut self, skin: &Skin, bus: usize, is_timed: bool) {
+        if is_timed != self.timed.is_some() {
+            self.timed = is_timed.then(|| {
+                let bound = self.rates.and_then(|rates| fit::last_reply_bound_us(skin, bus, rates));
+                Box::new(TimedBus {
+                    replies: ReplyTimes::default(),
+                    last_reply_bound_us: bound,
+                    figures: None,
+                })
+            });
         }
     }
 
     /// Sets the figures of the server of a timed bus. Load and upper bound follow its bit rates.
     pub(crate) fn set_figures(&mut self, skin: &Skin, bus: usize, figures: TimedReport) {
-        let rates = figures.rates.parse().ok();
-        if rates.is_some() && rates != self.rates {
-            self.rates = rates;
-            self.last_reply_bound_ns = rates.and_then(|rates| fit::last_reply_bound_ns(skin, bus, rates));
+        let Some(timed) = &mut self.timed else { return };
+        if let Ok(rates) = figures.rates.parse()
+            && self.rates != Some(rates)
+        {
+            self.rates = Some(rates);
+            timed.last_reply_bound_us = fit::last_reply_bound_us(skin, bus, rates);
         }
-        self.figures = Some(figures);
+        timed.figures = Some(figures);
     }
 
-    pub(super) const fn figures(&self) -> Option<&TimedReport> {
-        self.figures.as_ref()
-    }
-
-    /// Returns the times of replies; `None` on a bus on which frames take no time.
-    pub(crate) fn reply_times(&self) -> Option<&ReplyTimes> {
-        self.replies.as_deref()
+    /// Returns what only a timed bus has; `None` on a bus on which frames take no time.
+    pub(crate) fn timed(&self) -> Option<&TimedBus> {
+        self.timed.as_deref()
     }
 
     pub(super) const fn rates(&self) -> Option<BitRates> {
         self.rates
-    }
-
-    pub(super) const fn last_reply_bound_ns(&self) -> Option<u64> {
-        self.last_reply_bound_ns
     }
 
     pub(crate) const fn bus_load(&self) -> Option<f64> {

@@ -11,8 +11,7 @@ use protocol::schema::{FieldFormat, PacketSchema};
 use protocol::time::Micros;
 use serde::Serialize;
 
-use super::bus::LiveBus;
-use super::replies::ReplyTimes;
+use super::bus::{LiveBus, TimedBus};
 use super::{DecodedFrame, LiveState, TorqueExplanation};
 use crate::page_command::SelectedCell;
 use crate::player::PlayerStatus;
@@ -322,13 +321,12 @@ impl LiveState {
 }
 
 impl LiveBus {
-    fn timed_bus_status(&self, replies: &ReplyTimes) -> TimedBusStatus {
+    fn timed_bus_status(&self, timed: &TimedBus) -> TimedBusStatus {
         TimedBusStatus {
             rates: self.rates().map(|rates| rates.to_string()),
-            last_reply_ms: replies.longest_of_second_ms(),
-            #[expect(clippy::cast_precision_loss, reason = "2^53 ns are 104 days")]
-            bound_ms: self.last_reply_bound_ns().map(|nanos| nanos as f64 * 1e-6),
-            queues: self.figures().map(|figures| TransmitQueues {
+            last_reply_ms: timed.replies.longest_of_second_ms(),
+            bound_ms: timed.last_reply_bound_us.map(|micros| micros * 1e-3),
+            queues: timed.figures.as_ref().map(|figures| TransmitQueues {
                 waiting: figures.waiting,
                 wait_us: figures.wait_us,
                 refused: figures.refused,
@@ -357,7 +355,7 @@ impl LiveBus {
             saturated: counters.event_count(FrameEvent::Saturated),
             dropped: self.dropped,
             error_nm: errors.mean(),
-            timed: self.reply_times().map(|replies| self.timed_bus_status(replies)),
+            timed: self.timed().map(|timed| self.timed_bus_status(timed)),
             tree: self.sums.then(|| {
                 let cells = self.table.statuses(now).map(|(cell, status)| {
                     let sends = !matches!(status, CellStatus::Dead | CellStatus::Unknown);

@@ -1,9 +1,11 @@
 //! The figures of a timed bus.
 
 use std::collections::BTreeMap;
+use std::path::Path;
+use std::time::Duration;
 
 use bus_model::TransmitQueue;
-use protocol::bus::embedded::MAX_FIGURES_BYTES;
+use protocol::bus::embedded::{FiguresRequest, MAX_FIGURES_BYTES};
 use protocol::quantiles::{Quantiles, TimeHistogram};
 use protocol::wire_time::BitRates;
 use serde::{Deserialize, Serialize};
@@ -68,6 +70,13 @@ impl TimedReport {
         }
         let (refused_by_id, waiting_by_id) = <_>::default();
         serde_json::to_vec(&Self { refused_by_id, waiting_by_id, ..self.clone() }).unwrap_or_default()
+    }
+
+    /// Requests the present report from the server of a bus in `directory`, or else in the usual one, and waits for it.
+    /// Returns `None` if the server does not answer in time, or if frames take no time on its bus.
+    #[must_use]
+    pub fn request(name: &str, directory: Option<&Path>, timeout: Duration) -> Option<Self> {
+        Self::from_json(&FiguresRequest::send(name, directory).ok()?.receive(timeout)?)
     }
 
     /// Returns the report with the counts since an earlier report of the same server. Quantiles and maxima stay those since the

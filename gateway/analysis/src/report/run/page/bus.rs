@@ -186,8 +186,8 @@ impl PageDraft<'_> {
         self.bus_shadows.iter().find(|bus| bus.bus == bus_figures.name && bus.is_timed)?;
         let skin = &self.run.skin;
         let index = skin.bus_index(&bus_figures.name)?;
-        let nanos = fit::last_reply_bound_ns(skin, index, bus_figures.rates.rates)?;
-        Some(MarkLine::at_y(nanos as f64 / 1e6, "worst case of skinbus fit"))
+        let micros = fit::last_reply_bound_us(skin, index, bus_figures.rates.rates)?;
+        Some(MarkLine::at_y(micros / 1e3, "worst case of skinbus fit"))
     }
 
     /// Creates the findings on whether real buses can carry the traffic, in this run and in the worst case. They are
