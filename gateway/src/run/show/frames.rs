@@ -39,7 +39,7 @@ pub(super) fn add_timed_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verb
     let load = timed.load.map_or_else(|| "-".to_owned(), |load| format!("{:.1} %", load * 100.0));
     rows.add_row("  bus load", load, format!("of {}, transmit queues {}", timed.rates, timed.queue));
     rows.add_row(
-        "  waiting and sending, µs",
+        "  wait and send, µs",
         format_quantiles(&timed.wait_us),
         "from a frame's request to its end",
     );
