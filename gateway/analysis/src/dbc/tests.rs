@@ -1,6 +1,7 @@
 //! Reads the text with another parser, and compares it with the protocol's own encoding.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::LazyLock;
 
 use can_dbc::{AttributeValue, ByteOrder, Dbc, MessageId, MultiplexIndicator, ValueDescription, ValueType};
 use proptest::prelude::*;
@@ -12,11 +13,14 @@ mod said;
 use super::*;
 use model::generate::{self, SkinRequest};
 
-/// Returns a skin with cells 1 to 254 on its only bus.
-fn full() -> Skin {
+/// The skin with cells 1 to 254 on its only bus.
+static FULL_SKIN: LazyLock<Skin> = LazyLock::new(|| {
     let target = SkinRequest { cells: 254, ..SkinRequest::default() };
     Skin::parse("full.toml", &generate::generate(&target).unwrap()).unwrap()
-}
+});
+
+/// Its DBC, which takes seconds to parse.
+static FULL: LazyLock<Dbc> = LazyLock::new(|| parsed(&FULL_SKIN, 0));
 
 fn parsed(skin: &Skin, bus: usize) -> Dbc {
     Dbc::try_from(dbc_text(skin, bus).as_str()).unwrap()
@@ -65,8 +69,7 @@ fn by_id(dbc: &Dbc) -> BTreeMap<u16, &can_dbc::Message> {
 
 #[test]
 fn every_message_says_through_the_dbc_what_the_protocol_says() {
-    let dbc = parsed(&full(), 0);
-    let messages = by_id(&dbc);
+    let messages = by_id(&FULL);
     let mut met: BTreeSet<(u16, String)> = BTreeSet::new();
     let counts = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 12, 16, 17, 18, 19, 20, 21, 99, 126, 127];
     let counts = counts.into_iter().flat_map(|count: u8| [count, count + 128]);
@@ -107,8 +110,7 @@ fn every_message_says_through_the_dbc_what_the_protocol_says() {
 
 #[test]
 fn every_identifier_of_the_bus_is_there_and_no_other() {
-    let dbc = parsed(&full(), 0);
-    let messages = by_id(&dbc);
+    let messages = by_id(&FULL);
     for id in 0..0x800 {
         let packet =
             |count| Packet { id: Id::from_bits(id), words: Words::default(), epoch: Epoch(0), count };
@@ -118,8 +120,8 @@ fn every_identifier_of_the_bus_is_there_and_no_other() {
     for message in messages.values() {
         assert_eq!(message.size, 16, "{}", message.name);
     }
-    let names: BTreeSet<_> = dbc.messages.iter().map(|message| &message.name).collect();
-    assert_eq!(names.len(), dbc.messages.len(), "no name twice");
+    let names: BTreeSet<_> = FULL.messages.iter().map(|message| &message.name).collect();
+    assert_eq!(names.len(), FULL.messages.len(), "no name twice");
 }
 
 #[test]
@@ -279,7 +281,7 @@ fn each_bus_has_its_own_cells_and_one_that_is_not_has_no_text() {
 #[test]
 fn the_text_is_plain() {
     // Readers differ in the non-ASCII bytes that they accept, and most limit names to 32 characters.
-    let text = dbc_text(&full(), 0);
+    let text = dbc_text(&FULL_SKIN, 0);
     assert!(text.is_ascii());
     let names = text
         .lines()
