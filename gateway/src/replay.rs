@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use bench::replay::comparator::StepHistogram;
 use bench::replay::player::ReplaySpeed;
-use bench::replay::replay_plan::SenderFilter;
+use bench::replay::replay_plan::{SenderFilter, reason};
 use bench::replay::report::{ReplyComparison, Summary};
 use bench::replay::survey::TimeRange;
 use bench::replay::{ReplayError, ReplayOptions, SpawnOptions, replay};
@@ -228,7 +228,7 @@ fn table(summary: &Summary, is_coloured: bool) -> String {
     rows.add_row_unless_zero("refused", summary.refused, "the queue of a bus stayed full");
     rows.add_row_unless_zero("lost", summary.lost, "a bus was down");
     for (reason, count) in &summary.skipped {
-        rows.add_row("not sent", count, reason);
+        rows.add_row("not sent", count, skip_reason_words(reason));
     }
     rows.add_row_unless_zero("sent without delay", summary.sent_at_once, "their time stamps go backwards");
     if let (Some(late), Some(idle)) = (&summary.late_us, &summary.idle_late_us) {
@@ -261,6 +261,22 @@ fn table(summary: &Summary, is_coloured: bool) -> String {
     first_line
         + &rows.to_text()
         + &or_else_text(first.map(|first| format!("{}\n", printable_lines(&first.text))), "")
+}
+
+/// Words for a reason of not sending frames; the summary has the reason itself.
+fn skip_reason_words(reason: &'static str) -> &'static str {
+    match reason {
+        reason::BEFORE_PART => "recorded before --from",
+        reason::AFTER_PART => "recorded at --to or later",
+        reason::BUS_NOT_SELECTED => "of buses that --bus does not name",
+        reason::NO_INPUT => "from cells or other programs",
+        reason::NO_REPLY => "not from cells",
+        reason::ERROR_FRAME => "error frames",
+        reason::SIMULATED_WIRE => "of simulated wires",
+        reason::BUS_ADDED_LATER => "of buses that were added to the capture later",
+        reason::NOTE_BETWEEN_FRAMES => "notes, not frames",
+        other => other,
+    }
 }
 
 fn comparison_rows(rows: &mut KeyValueTable, expect: &ReplyComparison) {

@@ -223,7 +223,7 @@ fn add_control_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: boo
 
 fn add_reply_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     let replies = &bus.replies;
-    rows.add_section(&bus.name, counts_by_kind(&bus.cells), &bus.kind);
+    rows.add_section(&bus.name, frames::cells_by_status(&bus.cells), format!("{} bus", bus.kind));
     if bus.outages.times > 0 {
         let end = if bus.outages.at_end { ", also at the end" } else { "" };
         let ticks = format!("{} ran without this bus", count_with_noun(bus.outages.ticks, "tick"));
@@ -463,13 +463,14 @@ fn add_cost_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) 
     let cores = format!("{:.3}", gateway + cells + buses);
     if is_verbose {
         rows.add_section("cost", "", "");
-        let parts = format!("gateway {gateway:.3}, cells {cells:.3}, buses {buses:.3}");
+        let parts = format!("gateway {gateway:.3}, cells {cells:.3}, bus servers {buses:.3}");
         rows.add_row("processor, cores", cores, parts);
         if let Some(kib) = summary.memory.cell_private_kib {
-            rows.add_row("private memory of a cell process", format!("{kib} KiB"), "the largest");
+            rows.add_row("private memory of a cell process", format!("{kib} KiB"), "of the largest one");
         }
         if let Some(kib) = summary.memory.gateway_private_kib {
-            let buses = summary.memory.buses_private_kib.map(|kib| format!("of which bus servers {kib} KiB"));
+            let buses =
+                summary.memory.buses_private_kib.map(|kib| format!("{kib} KiB of it for bus servers"));
             rows.add_row("private memory of the gateway", format!("{kib} KiB"), buses.unwrap_or_default());
         }
         rows.add_row("start to first broadcast", format!("{:.2} s", summary.first_broadcast_s), "");

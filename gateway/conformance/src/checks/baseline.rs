@@ -128,7 +128,7 @@ fn check_rule_ranges(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.check("BASE-1", reply == Reply::Refused(19), || {
             format!(
                 "while the baseline is off, the cell must refuse a write of {} to parameter {number} with \
-                 reason 19, but the answer was {reply}",
+                 reason 19 (invalid value), but the answer was {reply}",
                 Reply::Value(bad)
             )
         });

@@ -73,7 +73,7 @@ fn check_options(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.about.test_mode = words == Some(1);
     session.known.test_mode = Some(words == Some(1));
     let is_known = words == Some(1) || reply == Reply::Refused(19);
-    session.check("OPT-1", is_known, || format!("a write of 1 to parameter 5 must be accepted, or refused with reason 19, but the answer was {reply}"));
+    session.check("OPT-1", is_known, || format!("a write of 1 to parameter 5 must be accepted, or refused with reason 19 (invalid value), but the answer was {reply}"));
     if session.about.test_mode {
         session.switch_test_mode(true)?;
     }
@@ -81,14 +81,14 @@ fn check_options(session: &mut Session<'_>) -> Result<(), StopReason> {
     let reply = session.write_first_words(Parameter::Sensing.number(), [2])?;
     session.about.sensing = reply.words().is_some();
     session.check("OPT-1", session.about.sensing || reply == Reply::Refused(19), || {
-        format!("a write of 2 to parameter 7 must be accepted, or refused with reason 19, but the answer was {reply}")
+        format!("a write of 2 to parameter 7 must be accepted, or refused with reason 19 (invalid value), but the answer was {reply}")
     });
     session.write_first_words(Parameter::Sensing.number(), [0])?;
     let reply = session.write_parameter(Parameter::Baseline.number(), baseline::HELD_ZERO_RULE)?;
     session.about.baseline = reply.words().is_some();
     // A cell that implements the protocol without baselines refuses with 18.
     let is_known = session.about.baseline || matches!(reply, Reply::Refused(18 | 19));
-    session.check("OPT-1", is_known, || format!("a write of parameter 11 must be accepted, or refused with reason 18 or 19, but the answer was {reply}"));
+    session.check("OPT-1", is_known, || format!("a write of parameter 11 must be accepted, or refused with reason 18 (unknown parameter) or 19 (invalid value), but the answer was {reply}"));
     session.write_first_words(Parameter::Baseline.number(), [0])?;
     session.wait_for_late_packets()?;
     session.known.senses = false;

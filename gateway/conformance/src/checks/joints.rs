@@ -137,8 +137,8 @@ fn check_joint_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
         let id = if (1..=6).contains(&count) { "JOINTS-2" } else { "COUNT-1" };
         session.check(id, is_so, || {
             format!(
-                "a joints message with count {count} must be counted only in the counter 'meaning', but the \
-                 counters are {after}; before: {before}"
+                "a joints message with count {count} must raise only the counter of \
+                 packets with invalid contents ('meaning'), but the counters are {after}; before: {before}"
             )
         });
         // The epoch of the dropped joints does not become the last one.
@@ -178,8 +178,8 @@ fn check_joint_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
             && after.refused.length == before.refused.length;
         session.check("JOINTS-2", is_so, || {
             format!(
-                "a joints message with count 7 in 20 bytes must be counted in the counter 'meaning', but the \
-                 counters are {after}; before: {before}"
+                "a joints message with count 7 in 20 bytes must raise the counter of packets with \
+                 invalid contents ('meaning'), but the counters are {after}; before: {before}"
             )
         });
     }

@@ -253,7 +253,7 @@ fn check_unknown_parameters(session: &mut Session<'_>) -> Result<(), StopReason>
             session.write_first_words(number, [1, 2, 3])?
         };
         session.check("CONF-13", reply == Reply::Refused(18), || {
-            format!("parameter {number} does not exist and must be refused with reason 18, but the answer was {reply}")
+            format!("parameter {number} does not exist and must be refused with reason 18 (unknown parameter), but the answer was {reply}")
         });
     }
     for number in [10, 15, 48, 126] {
@@ -261,7 +261,7 @@ fn check_unknown_parameters(session: &mut Session<'_>) -> Result<(), StopReason>
         session.check("CONF-13", replies == [Reply::Refused(18); 2], || {
             let [read, write] = replies;
             format!(
-                "parameter {number} does not exist and must be refused with reason 18, but a read was \
+                "parameter {number} does not exist and must be refused with reason 18 (unknown parameter), but a read was \
                  answered with {read} and a write with {write}"
             )
         });

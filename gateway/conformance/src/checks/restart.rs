@@ -218,7 +218,7 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
         let range = expected - expected / 100 - 2_000..=expected + expected / 100 + 22_000 + late;
         session.check("CLAIM-5", range.contains(&took), || {
             format!(
-                "claiming ended after {:.1} ms, but it must end after {:.1} ms",
+                "the cell stopped claiming its node id after {:.1} ms; it must stop after {:.1} ms",
                 took as f64 / 1e3,
                 expected as f64 / 1e3
             )

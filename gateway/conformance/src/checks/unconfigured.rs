@@ -115,8 +115,8 @@ fn check_joints_unanswered(session: &mut Session<'_>) -> Result<(), StopReason> 
     let expected = can.count();
     session.check("COUNT-1", usize::from(counted) == expected, || {
         format!(
-            "{expected} joints messages whose count does not match their length must be counted in the \
-             counter 'meaning', but {counted} were"
+            "{expected} joints messages whose count does not match their length must be counted as packets \
+             with invalid contents (counter 'meaning'), but {counted} were"
         )
     });
     session.exchange_messages(&[Message::Resume])?;

@@ -1,9 +1,24 @@
 //! The rows about frames and packets on a bus.
 
+use std::collections::BTreeMap;
+
 use bench::summary::BusSummary;
+use model::table::CellStatus;
 
 use super::{add_unexplained_row, counts_by_kind, format_quantiles, reasons_text};
 use crate::print::{KeyValueTable, comma_separated, count_with_noun};
+
+/// Formats the numbers of cells by their status at the end of the run.
+pub(super) fn cells_by_status(cells: &BTreeMap<&'static str, usize>) -> String {
+    let words = [
+        (CellStatus::Active, "in contact"),
+        (CellStatus::Quiet, "not in contact"),
+        (CellStatus::Stale, "in contact, but late"),
+        (CellStatus::Dead, "dead"),
+        (CellStatus::Unknown, "never heard"),
+    ];
+    counts_by_kind(words.into_iter().filter_map(|(status, words)| Some((words, cells.get(status.name())?))))
+}
 
 pub(super) fn add_frame_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     let up = &bus.uplink;
@@ -65,7 +80,7 @@ pub(super) fn last_reply_remark(bus: &BusSummary, untimed: &str) -> String {
 
 /// Adds a row on the age of joints that cells have not received.
 pub(super) fn add_joint_age_row(rows: &mut KeyValueTable, bus: &BusSummary) {
-    let why = "large: a busy machine, or lost frames";
+    let why = "a large age: this machine was busy, or frames were lost";
     rows.add_row("age of joints that cells missed, µs", format_quantiles(&bus.joints_not_taken_us), why);
 }
 

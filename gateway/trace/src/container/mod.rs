@@ -121,7 +121,7 @@ pub enum FormatError {
     #[error("a message is on channel {0}, which the file does not define")]
     Channel(u16),
     /// A message does not match the type of its channel.
-    #[error("a message of {topic}: {source}")]
+    #[error("cannot decode a message of the topic {topic}: {source}")]
     Message {
         /// The topic.
         topic: String,
