@@ -67,8 +67,8 @@ pub(crate) struct BusKinds {
 /// The option for the time that frames take on embedded buses.
 #[derive(Args, Clone, Copy, Debug)]
 pub(crate) struct BusTimeOption {
-    /// Time that a frame takes on embedded buses: none; real, as on a real bus with the skin's bit rates (without rates:
-    /// 1M/5M); or real with another transmit queue, such as real:fifo:10 [default: as the skin says, else none]
+    /// Let frames on embedded buses take time: none; real, as long as on a real bus at the skin's bit rates (else 1M/5M);
+    /// or real:fifo:10 or real:priority:32, to choose the transmit queue too [default: as the skin says, else none]
     #[arg(long, value_name = "TIME")]
     bus_time: Option<BusTimeChoice>,
 }

@@ -54,7 +54,8 @@ pub(crate) struct DumpCommand {
     #[arg(required = true, value_name = "BUS|FILE")]
     sources: Vec<PathBuf>,
     /// Show only frames of these kinds: command, sum, torque, sensors, network, configure, configured, stimulus, wire,
-    /// foreign, damaged; or a single command: halt, joints, sync, resume, report. Kind foreign includes damaged
+    /// foreign (other protocols, and damaged), damaged (invalid packets); or these commands: halt, joints,
+    /// sync, resume, report
     #[arg(long, value_name = "KIND", value_delimiter = ',')]
     kind: Vec<FrameSelector>,
     /// Show only packets from or to these nodes: a node id, gateway or everyone

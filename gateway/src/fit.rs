@@ -42,9 +42,9 @@ const FOR_TRAFFIC: &str = "Options for traffic";
   skinbus fit run.log --skin skin.toml --json | jq -c 'select(.end_s and .end_s - .time > 0.016)'
   skinbus fit vcan0 vcan1 --duration 10")]
 pub(crate) struct FitCommand {
-    /// Skin file, for its worst case; or traffic, from a candump log, an MCAP recording (all parts of a split one) or
-    /// live buses. - is standard input: a skin if --table, --format or --computation is given, else
-    /// traffic
+    /// What to test: a skin file, of which the worst case is computed; or recorded frames, in a candump log or an MCAP
+    /// recording (all parts of a split one); or live buses. - reads standard input: a skin with --table, --format or
+    /// --computation, else frames
     #[arg(value_name = "SKIN|FILE|BUS", required = true)]
     sources: Vec<PathBuf>,
     /// Nominal bit rate in bit/s, used for identifiers and for whole classic frames, such as 1000000, 500k or 1M

@@ -95,7 +95,10 @@ impl Session<'_> {
                     .to_owned(),
             );
         } else if !self.restore_stored_parameters(saved)? {
-            left.push(format!("its configuration {:04X} could not be committed", saved.hash));
+            left.push(format!(
+                "the cell's earlier configuration (hash {:04X}) could not be stored again",
+                saved.hash
+            ));
         }
         for parameter in VOLATILE_PARAMETERS {
             let Some(words) = saved.parameters.get(&parameter.number()) else { continue };

@@ -190,9 +190,9 @@ fn add_control_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: boo
     if is_verbose && control.central_us.count > 0 {
         rows.add_row("tick duration", format_quantiles(&control.took_us), "");
         rows.add_row(
-            "  of which central computation",
+            "  its central computation",
             format_quantiles(&control.central_us),
-            "0 in distributed mode",
+            "part of it; none in distributed mode",
         );
     }
     if is_verbose && control.took_distributed_us.count > 0 {
@@ -281,14 +281,14 @@ fn add_reply_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) 
             [replies.contact_unknown, replies.unexpected],
         );
         if !is_brief {
-            rows.add_row("  in time", replies.in_time, format!("{} late", replies.late));
+            rows.add_row("  replies in time", replies.in_time, format!("{} late", replies.late));
             let missing = replies.due - replies.in_time - replies.late;
             if is_verbose || missing > 0 {
                 let [reasons @ .., _] =
                     replies.missing_replies_by_reason().map(|(why, count)| (count, key_words(why)));
                 add_unexplained_row(
                     rows,
-                    "  missing",
+                    "  missing replies",
                     missing,
                     reasons_text(&reasons, replies.unknown),
                     replies.unknown,
@@ -469,8 +469,7 @@ fn add_cost_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) 
             rows.add_row("private memory of a cell process", format!("{kib} KiB"), "of the largest one");
         }
         if let Some(kib) = summary.memory.gateway_private_kib {
-            let buses =
-                summary.memory.buses_private_kib.map(|kib| format!("{kib} KiB of it for bus servers"));
+            let buses = summary.memory.buses_private_kib.map(|kib| format!("{kib} KiB in bus servers"));
             rows.add_row("private memory of the gateway", format!("{kib} KiB"), buses.unwrap_or_default());
         }
         rows.add_row("start to first broadcast", format!("{:.2} s", summary.first_broadcast_s), "");

@@ -33,7 +33,8 @@ pub(crate) struct SlcanOptions {
     /// Name of the bus
     #[arg(value_parser = parse_bus_name)]
     bus: String,
-    /// Serial lines to the adapters: PATH, unix:PATH or tcp:HOST:PORT, each with options after commas, such as ,cell=12
+    /// Serial lines to the adapters: PATH, unix:PATH or tcp:HOST:PORT. Options of one line follow after commas, such as
+    /// PATH,cell=12 for --cell 12
     #[arg(value_name = "LINE", required = true)]
     lines: Vec<LineOptions>,
     /// Node id of the cell on each LINE; repeat the option in the order of the lines

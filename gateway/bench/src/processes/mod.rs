@@ -78,7 +78,7 @@ pub enum LaunchError {
         needed: u64,
     },
     /// An embedded bus is not served.
-    #[error("{path} does not serve the bus {bus}; see its own message above")]
+    #[error("the program {path} was started to serve the bus {bus}, but ended; it printed the reason above")]
     Serve {
         /// Path of the serving program.
         path: PathBuf,

@@ -145,8 +145,8 @@ fn check_joint_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
         let step = session.send_joints_at_epoch(epoch, &POSITIONS)?;
         session.check("JOINTS-2", step.torque.is_some(), || {
             format!(
-                "the cell must answer the valid joints message of epoch {epoch} that follows one with a wrong \
-                 count, but it did not"
+                "after a joints message with a wrong count byte, the cell must answer the next valid one, of \
+                 epoch {epoch}, but it did not"
             )
         });
         before = session.counters()?;

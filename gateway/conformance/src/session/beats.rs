@@ -44,8 +44,8 @@ impl Session<'_> {
         if self.clock.longest < HEARTBEAT_INTERVAL {
             self.begin_expected_exchange();
             self.check("BEAT-1", surplus == 0, || {
-                let many = if surplus > 0 { "too many" } else { "too few" };
-                format!("the cell sent {} heartbeats {many} over the whole test", surplus.abs())
+                let many = if surplus > 0 { "more" } else { "fewer" };
+                format!("over the whole test the cell sent {} heartbeats {many} than are due", surplus.abs())
             });
         }
     }

@@ -52,15 +52,15 @@ pub(super) fn add_frame_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verb
 pub(super) fn add_timed_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     let Some(timed) = &bus.timed else { return };
     let load = timed.load.map_or_else(|| "-".to_owned(), |load| format!("{:.1} %", load * 100.0));
-    rows.add_row("  bus load", load, format!("of {}, transmit queues {}", timed.rates, timed.queue));
+    rows.add_row("  bus load", load, format!("at {}, with transmit queues {}", timed.rates, timed.queue));
     rows.add_row(
-        "  wait and send, µs",
+        "  time of a frame, µs",
         format_quantiles(&timed.wait_us),
-        "from a frame's request to its end",
+        "from the request to send it to its end",
     );
     if is_verbose || timed.behind > 0 {
         let behind = format!(
-            "from a frame's end to its delivery; {} over 1 ms",
+            "from the frame's end to the receivers; {} over 1 ms",
             count_with_noun(timed.behind, "time")
         );
         rows.add_row("  delivery, µs", format_quantiles(&timed.delay_us), behind);

@@ -133,7 +133,7 @@ pub enum FormatError {
     Unknown(u8),
     /// The operation code does not fit the place of the record in the file, or its contents.
     #[error(
-        "a record has the operation code {0:02x}, but the position or contents of another kind of record"
+        "a record of operation code {0:02x} is in the wrong place, or its contents are not those of this code"
     )]
     Code(u8),
     /// The length field of a record contradicts the length of its contents.

@@ -26,7 +26,9 @@ pub enum ParameterError {
         joints: i16,
     },
     /// The normal does not have unit length.
-    #[error("the squared length of the outward normal is {got} / 2^28; it must be within 1/64 of 1")]
+    #[error(
+        "the outward normal must have the length 1, but its squared length is {got} / 2^28; allowed: 63/64 to 65/64"
+    )]
     Normal {
         /// Square of the length, in steps of 2^-28.
         got: i64,
