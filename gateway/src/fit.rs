@@ -42,7 +42,7 @@ const FOR_TRAFFIC: &str = "Options for traffic";
   skinbus fit run.log --skin skin.toml --json | jq -c 'select(.end_s and .end_s - .time > 0.016)'
   skinbus fit vcan0 vcan1 --duration 10")]
 pub(crate) struct FitCommand {
-    /// What to test: a skin file, of which the worst case is computed; or recorded frames, in a candump log or an MCAP
+    /// Skin file, of which the worst case is computed; or recorded frames, in a candump log or an MCAP
     /// recording (all parts of a split one); or live buses. - reads standard input: a skin with --table, --format or
     /// --computation, else frames
     #[arg(value_name = "SKIN|FILE|BUS", required = true)]

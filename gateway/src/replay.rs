@@ -268,7 +268,7 @@ fn skip_reason_words(reason: &'static str) -> &'static str {
     match reason {
         reason::BEFORE_PART => "recorded before --from",
         reason::AFTER_PART => "recorded at --to or later",
-        reason::BUS_NOT_SELECTED => "of buses that --bus does not name",
+        reason::BUS_NOT_SELECTED => "of buses that are not replayed",
         reason::NO_INPUT => "from cells or other programs",
         reason::NO_REPLY => "not from cells",
         reason::ERROR_FRAME => "error frames",

@@ -78,7 +78,9 @@ pub enum LaunchError {
         needed: u64,
     },
     /// An embedded bus is not served.
-    #[error("the program {path} was started to serve the bus {bus}, but ended; it printed the reason above")]
+    #[error(
+        "the program {path} was started to serve the bus {bus}, but did not report that it does; see its messages above"
+    )]
     Serve {
         /// Path of the serving program.
         path: PathBuf,

@@ -206,7 +206,7 @@ fn check_saturated_jacobian(
         session.check("J-2", is_held, || {
             let word = if sign > 0 { "8000" } else { "7FFF" };
             format!(
-                "for a contact {:.1} m from the joint's axis, the Jacobian J must saturate at {word}, but it is {first:04X}",
+                "with a lever arm of {:.1} m about the joint's axis, the Jacobian J must saturate at {word}, but it is {first:04X}",
                 -3.78 * f64::from(sign)
             )
         });

@@ -13,11 +13,12 @@ pub(super) fn cells_by_status(cells: &BTreeMap<&'static str, usize>) -> String {
     let words = [
         (CellStatus::Active, "in contact"),
         (CellStatus::Quiet, "not in contact"),
-        (CellStatus::Stale, "in contact, but late"),
-        (CellStatus::Dead, "dead"),
-        (CellStatus::Unknown, "never heard"),
+        (CellStatus::Stale, "in contact without a reply"),
     ];
-    counts_by_kind(words.into_iter().filter_map(|(status, words)| Some((words, cells.get(status.name())?))))
+    counts_by_kind(cells.iter().map(|(&name, count)| {
+        let words = words.iter().find(|(status, _)| status.name() == name).map_or(name, |(_, words)| words);
+        (words, count)
+    }))
 }
 
 pub(super) fn add_frame_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {

@@ -39,7 +39,7 @@ struct BusLoad {
     share: Option<f64>,
 }
 
-/// What only a bus has on which frames take time.
+/// The reply times, bound and figures of a bus on which frames take time.
 #[derive(Clone, Debug)]
 pub(crate) struct TimedBus {
     pub(crate) replies: ReplyTimes,
@@ -68,7 +68,7 @@ pub(crate) struct LiveBus {
     pub(crate) dead_since: Vec<Option<Micros>>,
     rates: Option<BitRates>,
     load: BusLoad,
-    /// What only a bus has on which frames take time.
+    /// `None` on a bus on which frames take no time.
     timed: Option<Box<TimedBus>>,
     pub(crate) halted: bool,
     pub(crate) is_up: bool,
