@@ -237,7 +237,7 @@ fn names_cannot_command_a_terminal() {
 #[test]
 fn cells_are_counted_by_their_status_in_words() {
     let cells = [("active", 20), ("dead", 1), ("never heard", 2), ("quiet", 230), ("stale", 3)].into();
-    let said = super::frames::cells_by_status(&cells);
+    let said = frames::cells_by_status(&cells);
     assert_eq!(
         said,
         "20 in contact, 1 dead, 2 never heard, 230 not in contact, 3 in contact without a reply"
