@@ -11,16 +11,16 @@ const FILL = 0.84, TIGHT = 0.81, ROOMY = 0.88, MOST = 0.985;
 const RATE = Math.log(1.19), STIFF = 7;
 // If the robot becomes larger or smaller faster than the zoom may follow, beyond these shares, the view turns by itself:
 // how fast in rad/s, how far up and down, and the angle that it tries.
-const EASY = [0.78, 0.9], STEER_RATE = 1.2, STEERED = [0.15, 1.35], TRIED = 0.03;
-// Beyond these it turns as far as it takes, in four steps of at most this speed in rad/s.
-const HELD = [0.74, 0.95], RESCUE_RATE = 1.5;
+const EASY = [0.8, 0.88], STEER_RATE = 2, STEERED = [0.15, 1.35], TRIED = 0.03;
+// Beyond these it turns as far as it takes, in four steps, the longest of them at this speed in rad/s.
+const HELD = [0.74, 0.95], RESCUE_RATE = 5;
 // A view that a user turns follows faster.
 const TURNED_RATE = Math.log(4), TURNED_MS = 500;
 // The times in s in which the view follows a robot that moves aside, and reaches another direction.
 const FOLLOWED_S = 0.5, TURN_S = 0.45;
 const STEEPEST = 1.5;
 // The time in s for which a motion is expected to go on as it is.
-export const AHEAD_S = 0.4;
+export const AHEAD_S = 0.15;
 // The longest step in s in which the view follows a motion.
 const STEP_S = 1 / 30;
 
