@@ -3,13 +3,11 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use model::tracker::{CellTracker, DEAD_AFTER, HeartbeatKind, MAX_LATE_EPOCHS, UplinkAccount};
+use model::tracker::{CellTracker, DEAD_AFTER, HeartbeatKind, MAX_LATE_EPOCHS};
 use protocol::can::Format;
 use protocol::candump::Record;
 use protocol::id::{CellId, Command, Id, Node};
-use protocol::message::{
-    Answer, Heartbeat, Joints, Message, NetworkPage, ReceivedCounts, Request, State as Flags,
-};
+use protocol::message::{Answer, Joints, Message, NetworkPage, Request, State as Flags};
 use protocol::packet::{Epoch, data_frame_id};
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
@@ -18,11 +16,18 @@ use model::decode::{Decoded, Decoder};
 use model::latched::LatchedState;
 use trace::capture::{BusNote, CaptureNote, LatchedFrame};
 
+mod cell;
+
+pub use self::cell::SurveyedCell;
+
 /// Silence in ns after which a cell counts as absent.
 const ABSENCE_TIMEOUT_NS: u64 = DEAD_AFTER.0 * 1_000;
 
 /// Maximum time in ns from the first joints after a cell's start to the cell's first heartbeat.
 const MAX_CELL_START_NS: u64 = 100_000_000;
+
+/// Time in ns after which a commit that was not answered counts as lost.
+const COMMIT_TIMEOUT_NS: u64 = 3_000_000_000;
 
 /// Maximum number of joint broadcasts between the sending and the recording of a page of counters.
 const MAX_COUNTER_DELAY_BROADCASTS: usize = 64;
@@ -86,6 +91,9 @@ pub struct SurveyedBus {
     pub cells: BTreeMap<CellId, SurveyedCell>,
     /// State of cells according to messages from before the capture.
     before: BTreeMap<CellId, CellBeforeCapture>,
+    /// Cells that were told before the replayed part to commit and had not answered yet, with the time of the commit in
+    /// ns since 1970. The part begins with the new configuration, which their next heartbeats may lack.
+    committing: BTreeMap<CellId, u64>,
 }
 
 /// A broadcast of joints.
@@ -108,37 +116,6 @@ struct CellBeforeCapture {
     measures: bool,
 }
 
-/// Survey of one cell.
-#[derive(Clone, Debug)]
-pub struct SurveyedCell {
-    /// Hash of the cell's configuration where the replayed part begins, if known.
-    pub hash: InitialValue<u16>,
-    /// True if the cell measured in the replayed part, so that its torques cannot be reproduced.
-    pub measured: bool,
-    /// Times of the cell's first and last message in ns since 1970.
-    pub active: (u64, u64),
-    /// Starts and ends of the cell's long silences in ns since 1970.
-    pub silences: Vec<(u64, u64)>,
-    /// Number of packets that the cell sent but the capture lacks.
-    pub unrecorded: u64,
-    /// Number of joint broadcasts that the cell missed or processed too late.
-    pub untaken: u64,
-    /// Time ranges in ns since 1970 in which the cell's counters account for all joints: start exclusive, end
-    /// inclusive.
-    accounted: Vec<(u64, u64)>,
-    /// True if the capture contains counters that account for any joints. Otherwise each missing message is a
-    /// difference.
-    is_accounted: bool,
-    tracked: CellTracker,
-    /// Start of the cell's present claim of its node id in ns since 1970. A cell claims its id after each start.
-    claims: Option<u64>,
-    /// Time in ns since 1970 at which the cell's bus was lost; `None` once the cell sends again.
-    away: Option<u64>,
-    /// Counters of the cell's last report, the number of joint broadcasts before it, and the time of the last of them
-    /// in ns since 1970.
-    report: Option<(ReceivedCounts, u64, u64)>,
-}
-
 /// Position of a frame relative to the replayed part.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum ReplayPartPosition {
@@ -146,6 +123,18 @@ enum ReplayPartPosition {
     Before,
     In,
     After,
+}
+
+/// Circumstances in which a cell sent a message.
+#[derive(Clone, Copy, Debug)]
+struct MessageContext<'a> {
+    /// Time in ns since 1970.
+    nanos: u64,
+    place: ReplayPartPosition,
+    /// True if the cell has not answered a commit from before the replayed part.
+    commits: bool,
+    /// Latest joint broadcasts, oldest first.
+    joints: &'a VecDeque<JointsBroadcast>,
 }
 
 /// A value at the start of the replayed part. It is known if a cell reports it later, before the value changes.
@@ -282,6 +271,7 @@ impl Survey {
 impl SurveyedBus {
     /// Handles a message from before the capture that is latched at its start.
     fn add_latched_message(&mut self, message: &Message, nanos: u64) {
+        self.follow_commit(message, nanos, ReplayPartPosition::Before);
         if let Message::Network { from: Node::Cell(from), page: NetworkPage::Heartbeat(heartbeat), .. } =
             *message
         {
@@ -323,8 +313,11 @@ impl SurveyedBus {
         }
         self.is_accounted |= matches!(message, Message::Network { page: NetworkPage::Received(_), .. });
         self.sums += u64::from(matches!(message, Message::Sum { .. }));
+        let commits = from.is_some_and(|from| self.is_committing(from, nanos));
+        self.follow_commit(message, nanos, place);
         if let Some(cell) = from.and_then(|from| self.cells.get_mut(&from)) {
-            cell.add_message(message, nanos, place, &self.recent_joints);
+            let context = MessageContext { nanos, place, commits, joints: &self.recent_joints };
+            cell.add_message(message, &context);
         } else if let Message::Joints { epoch, joints } = *message {
             self.joints += 1;
             self.recent_joints.push_back(JointsBroadcast { epoch, number: self.joints, nanos });
@@ -337,150 +330,31 @@ impl SurveyedBus {
         }
     }
 
+    /// Follows commits of the cells' parameters, and their answers.
+    fn follow_commit(&mut self, message: &Message, nanos: u64, place: ReplayPartPosition) {
+        let commit = Parameter::Commit.number();
+        if let Message::Configure { to: Node::Cell(to), request: Request::Write { number, .. }, .. } =
+            *message
+            && (number, place) == (commit, ReplayPartPosition::Before)
+        {
+            self.committing.insert(to, nanos);
+        } else if let Message::Configured { from, answer, .. } = *message
+            && let Answer::Value { number, written: true, .. } | Answer::Refused { number, .. } = answer
+            && number == commit
+        {
+            self.committing.remove(&from);
+        }
+    }
+
+    /// Returns true if a cell has not answered a commit from before the replayed part.
+    fn is_committing(&self, cell: CellId, nanos: u64) -> bool {
+        self.committing.get(&cell).is_some_and(|at| nanos <= at.saturating_add(COMMIT_TIMEOUT_NS))
+    }
+
     /// Returns the cells that send between two times, in ns since 1970.
     pub fn cells_active_in(&self, (from, to): (u64, u64)) -> impl Iterator<Item = (CellId, &SurveyedCell)> {
         let speaks = move |cell: &SurveyedCell| cell.active.1 >= from && cell.active.0 < to;
         self.cells.iter().map(|(cell, it)| (*cell, it)).filter(move |(_, cell)| speaks(cell))
-    }
-}
-
-impl SurveyedCell {
-    fn new(nanos: u64, before: Option<&CellBeforeCapture>) -> Self {
-        // A cell that sent just before the capture was present when it began.
-        let is_present = |last: &u64| nanos <= last.saturating_add(ABSENCE_TIMEOUT_NS);
-        let first = before.map(|before| before.last_seen).filter(is_present);
-        let mut tracked = before.map(|before| before.tracked.clone()).unwrap_or_default();
-        // It is not known that messages of the cell between the two times are lost.
-        tracked.account = UplinkAccount::default();
-        Self {
-            hash: before.map_or(InitialValue::No, |before| before.hash),
-            measured: before.is_some_and(|before| before.measures),
-            active: (first.map_or(nanos, |heard| heard.min(nanos)), nanos),
-            silences: Vec::new(),
-            unrecorded: 0,
-            untaken: 0,
-            accounted: Vec::new(),
-            is_accounted: false,
-            tracked,
-            claims: None,
-            report: None,
-            away: None,
-        }
-    }
-
-    fn mark_seen(&mut self, nanos: u64) {
-        let last = self.active.1;
-        if nanos > last.saturating_add(ABSENCE_TIMEOUT_NS) {
-            self.silences.push((last, nanos));
-        }
-        self.active.1 = last.max(nanos);
-        if let Some(away) = self.away.take() {
-            self.silences.push((away, nanos));
-        }
-    }
-
-    /// Ends the survey of the cell at the end of the capture, `nanos` in ns since 1970.
-    fn finish(&mut self, nanos: u64) {
-        self.unrecorded = self.tracked.account.uplink().lost;
-        if let Some(away) = self.away {
-            self.silences.push((away, u64::MAX));
-        }
-        let from = self.claims.unwrap_or(self.active.1);
-        if nanos > from.saturating_add(ABSENCE_TIMEOUT_NS) || self.claims.is_some() {
-            self.silences.push((from, u64::MAX));
-        }
-    }
-
-    /// Handles a message that the cell sent after these joints.
-    fn add_message(
-        &mut self,
-        message: &Message,
-        nanos: u64,
-        place: ReplayPartPosition,
-        joints: &VecDeque<JointsBroadcast>,
-    ) {
-        let word = self.tracked.record_packet(Micros(nanos / 1_000), message, None).word;
-        if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = message {
-            match word {
-                Some(HeartbeatKind::Claimant | HeartbeatKind::Outsider | HeartbeatKind::Overtaken) | None => {
-                    return;
-                }
-                // A restart sets the counters to 0. They then count joints from before this heartbeat.
-                Some(HeartbeatKind::Started { .. }) => {
-                    let last = joints.back().map(|last| (last.number, last.nanos)).unwrap_or_default();
-                    let may_count =
-                        |joints: &&JointsBroadcast| nanos <= joints.nanos.saturating_add(MAX_CELL_START_NS);
-                    let early = joints.iter().rev().take_while(may_count).count() as u64;
-                    self.report = Some((ReceivedCounts::default(), last.0.saturating_sub(early), last.1));
-                }
-                Some(HeartbeatKind::First | HeartbeatKind::Continued | HeartbeatKind::Shared) => {}
-            }
-            self.add_heartbeat(heartbeat, nanos, place);
-        } else if let Message::Network { page: NetworkPage::Received(heard), epoch, .. } = *message {
-            // The page carries the epoch of the last joints that its counters include.
-            let at = joints.iter().rev().find(|joints| joints.epoch == epoch);
-            self.add_counters(heard, at.map(|joints| (joints.number, joints.nanos)));
-        } else if let Message::Configured { answer: Answer::Value { number, written: true, .. }, .. } =
-            *message
-            && number == Parameter::Commit.number()
-        {
-            // The cell was configured again before its first heartbeat, so its former configuration is unknown.
-            self.hash = match self.hash {
-                _ if place == ReplayPartPosition::Before => InitialValue::No,
-                InitialValue::No => InitialValue::TooLate,
-                known @ (InitialValue::TooLate | InitialValue::Value(_)) => known,
-            };
-        }
-    }
-
-    fn add_heartbeat(&mut self, heartbeat: &Heartbeat, nanos: u64, place: ReplayPartPosition) {
-        // A cell that claims its node id answers nothing.
-        if heartbeat.state.has(Flags::CLAIMING_NODE_ID) {
-            self.claims.get_or_insert(nanos);
-            return;
-        }
-        if let Some(since) = self.claims.take() {
-            self.silences.push((since, nanos));
-        }
-        if place == ReplayPartPosition::Before || self.hash == InitialValue::No {
-            self.hash = InitialValue::Value(heartbeat.configuration);
-        }
-        self.measured |= place == ReplayPartPosition::In && !heartbeat.state.has(Flags::TEST_MODE);
-    }
-
-    /// Handles a report of counters. `at` is the number and time of the last joints that they cover; it is `None` if
-    /// those joints came before the capture, so that it is unknown which joints the counters cover.
-    fn add_counters(&mut self, heard: ReceivedCounts, at: Option<(u64, u64)>) {
-        let Some((joints, last)) = at else { return };
-        if let Some((before, joints_before, from)) = self.report {
-            let taken = heard.joints.wrapping_sub(before.joints);
-            let repeated = heard.joints_repeated.wrapping_sub(before.joints_repeated);
-            let known = u64::from(taken) + u64::from(repeated);
-            let between = joints.saturating_sub(joints_before);
-            // A cell cannot receive more joints than were broadcast since its start, so it had not restarted.
-            if known <= between + MAX_COUNTER_DELAY_BROADCASTS as u64 {
-                self.untaken += between.saturating_sub(known);
-                match self.accounted.last_mut() {
-                    Some((_, until)) if *until == from => *until = last,
-                    _ => self.accounted.push((from, last)),
-                }
-            }
-        }
-        self.report = Some((heard, joints, last));
-    }
-
-    /// Returns true if counters account for the joints at this time, in ns since 1970, because the cell reported them
-    /// before and after it. Also returns true if the capture contains no counters that account for any joints: they
-    /// then explain no deviation.
-    #[must_use]
-    pub fn is_covered_by_counters(&self, nanos: u64) -> bool {
-        !self.is_accounted || self.accounted.iter().any(|&(from, until)| from < nanos && nanos <= until)
-    }
-
-    /// Returns true if the cell was in a long silence at `nanos`, in ns since 1970.
-    #[must_use]
-    pub fn is_silent_at(&self, nanos: u64) -> bool {
-        nanos < self.active.0 || self.silences.iter().any(|&(from, to)| (from..to).contains(&nanos))
     }
 }
 

@@ -1,4 +1,5 @@
 use protocol::candump::Timestamp;
+use protocol::message::{Heartbeat, ReceivedCounts};
 
 use super::*;
 
@@ -92,4 +93,48 @@ fn a_cell_may_have_taken_joints_before_its_first_heartbeat() {
     bus.joints(21..=30);
     // The cell began with epoch 15 and received all joints but three; which three is unknown.
     assert_eq!(bus.heard(30, 13), 4);
+}
+
+#[test]
+fn a_heartbeat_from_before_a_commit_is_answered_is_not_of_the_part_that_begins_with_it() {
+    let cell = CellId::new(1).unwrap();
+    let commit = Parameter::Commit.number();
+    let write = Message::Configure {
+        to: Node::Cell(cell),
+        tag: 1,
+        request: Request::Write { number: commit, words: [0; 6] },
+    };
+    let answer = |answer| Message::Configured { from: cell, tag: 1, answer };
+    let (written, refused) = (
+        answer(Answer::Value { number: commit, written: true, words: [0; 6] }),
+        answer(Answer::Refused { number: commit, reason: Answer::REFUSED_WRONG_HASH }),
+    );
+    let heartbeat = |configuration, sent| {
+        NetworkPage::Heartbeat(Heartbeat { configuration, sent, ..Heartbeat::default() })
+    };
+    let hash = |answer: Option<&Message>, pause, heartbeats: [u16; 2]| {
+        // The part begins between the commit and its answer.
+        let mut bus = CountingBus(Survey::new(TimeRange { from: Some(1_000), to: None }), 0);
+        bus.take(&write);
+        bus.1 = pause;
+        bus.page(0, heartbeat(heartbeats[0], 10));
+        bus.1 += 1_000;
+        if let Some(answer) = answer {
+            bus.take(answer);
+        }
+        bus.page(0, heartbeat(heartbeats[1], 11 + u16::from(answer.is_some())));
+        bus.0.buses[0].cells[&cell].hash
+    };
+    assert_eq!(hash(Some(&written), 2_000, [7, 9]), InitialValue::Value(9));
+    assert_eq!(hash(Some(&refused), 2_000, [7, 7]), InitialValue::Value(7));
+    assert_eq!(hash(None, 2_000, [7, 7]), InitialValue::No, "the commit may still come");
+    assert_eq!(hash(None, COMMIT_TIMEOUT_NS + 1_000, [7, 7]), InitialValue::Value(7), "it was lost");
+    // A commit of the part itself: the part begins with the former configuration.
+    let mut bus = CountingBus(Survey::new(TimeRange::default()), 0);
+    bus.page(0, heartbeat(7, 10));
+    for message in [&write, &written] {
+        bus.take(message);
+    }
+    bus.page(0, heartbeat(9, 12));
+    assert_eq!(bus.0.buses[0].cells[&cell].hash, InitialValue::Value(7));
 }
