@@ -14,6 +14,9 @@ const RATE = Math.log(1.19), STIFF = 7;
 const EASY = [0.8, 0.88], STEER_RATE = 2, STEERED = [0.15, 1.35], TRIED = 0.03;
 // Beyond these it turns as far as it takes, in four steps, the longest of them at this speed in rad/s.
 const HELD = [0.74, 0.95], RESCUE_RATE = 5;
+// If the robot still does not fit, by more than this share, the view changes to the nearest of directions this far away, in
+// rad, that help.
+const STUCK = 0.02, FAR = [0.3, 0.6, 1, 1.5];
 // A view that a user turns follows faster.
 const TURNED_RATE = Math.log(4), TURNED_MS = 500;
 // The times in s in which the view follows a robot that moves aside, and reaches another direction.
@@ -130,15 +133,17 @@ export class Camera {
       return Math.max(0, Math.log(HELD[0] / fill), Math.log(fill / HELD[1]));
     };
     let least = off(this.yaw, this.pitch);
-    for (let ring = 1; least > 0 && ring <= 4; ring++) {
-      const far = RESCUE_RATE * seconds * ring / 4;
-      let best = [this.yaw, this.pitch];
+    const around = (far) => {
+      let best = null;
       for (let k = 0; k < 12; k++) {
         const yaw = this.yaw + Math.cos(k * Math.PI / 6) * far, pitch = clamp(this.pitch + Math.sin(k * Math.PI / 6) * far, ...STEERED), it = off(yaw, pitch);
         if (it < least) [best, least] = [[yaw, pitch], it];
       }
-      [this.yaw, this.pitch] = best;
-    }
+      if (best) [this.yaw, this.pitch] = best;
+      return best !== null;
+    };
+    for (let ring = 1; least > 0 && ring <= 4; ring++) around(RESCUE_RATE * seconds * ring / 4);
+    if (least > STUCK) FAR.some(around);
   }
 
   // Moves aside so far that no point is outside the picture.

@@ -25,7 +25,7 @@ export const busColour = (bus) => BUSES[bus % BUSES.length];
 export const SHOWS = {
   force: { of: (cell) => cell.force / 1000, low: 0, high: 10, unit: "N", rest: (v) => v <= 0 },
   proximity: { of: (cell) => cell.proximity / 32768, low: 0, high: 1, unit: "", rest: (v) => v <= 0 },
-  temperature: { of: (cell) => cell.temperature / 100, low: 0, high: 60, unit: "°C", rest: () => false },
+  temperature: { of: (cell) => cell.temperature / 100, low: 0, high: 60, unit: "°C", rest: (v) => v === 0 },
   bus: { isBus: true },
 };
 

@@ -101,21 +101,21 @@ export function say(scene, said, ask, health, hardest) {
 }
 
 // The place of a cell in the skin: in the frame of its row.
-function where(scene, { bus, node }) {
+function where(scene, { bus, node }, joints) {
   const cell = scene.cells.find((it) => it.bus === bus && it.node === node);
   if (!cell) return [];
   const three = (values, digits) => values.map((v) => v.toFixed(digits).replace("-", "−")).join(", ");
   return [
-    ["DH row, joint", `${cell.row}, ${cell.joint}`],
+    ["On the link after", `${joints[cell.joint - 1]?.name ?? "the base"}, DH row ${cell.row}`],
     ["Position, mm", three(cell.position.map((v) => v * 1000), 1)],
     ["Normal", three(cell.normal, 3)],
   ];
 }
 
-// A field of a sensors page, by the schema.
+// A field of a sensors page, by the schema. The words of temperature sensors that a cell lacks are 0.
 function reading({ name, unit, decimals, values }) {
-  const title = name[0].toUpperCase() + name.slice(1);
-  return [unit ? `${title}, ${unit}` : title, values.map((v) => v.toFixed(decimals).replace("-", "−")).join(", ")];
+  const title = name[0].toUpperCase() + name.slice(1), absent = unit === "°C" && values.every((v) => v === 0);
+  return [unit ? `${title}, ${unit}` : title, absent ? "no sensor, or 0" : values.map((v) => v.toFixed(decimals).replace("-", "−")).join(", ")];
 }
 
 function detail(scene, it, ask, health) {
@@ -124,11 +124,11 @@ function detail(scene, it, ask, health) {
   const dead = it.dead_at_s !== null && it.dead_at_s !== undefined, silent = dead || it.status === "never heard";
   const lost = `${it.bus}:${it.node} lost`;
   health.count(lost, it.lost);
-  const values = [["Force", `${it.force_n.toFixed(3)} N`], ...it.readings.map(reading)];
+  const values = [["Force", it.force_n === null ? "unknown" : `${it.force_n.toFixed(3)} N`], ...it.readings.map(reading)];
   const rows = [
     ["Status", dead ? `dead since ${moment(it.dead_at_s, 1)}` : STATUSES[it.status] ?? it.status, it.status === "dead" || it.status === "stale" ? "bad" : ""],
     ["Serial number", String(it.serial)],
-    ...where(scene, it),
+    ...where(scene, it, joints),
     ["Configuration", wrong ? it.configuration.join(", expected ") : it.configuration[1], wrong ? "bad" : ""],
     ["Gains α: contact, proximity", it.gains.alpha.map(String).join(", ") + " N"],
     ["Thresholds: contact, proximity, force",

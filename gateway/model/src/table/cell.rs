@@ -1,9 +1,7 @@
 //! The gateway's state of one cell of a bus.
 
 use protocol::id::CellId;
-use protocol::message::{
-    Answer, Heartbeat, NetworkPages, SensorPage, SensorReadings, SkinSensors, State, StimulusStart,
-};
+use protocol::message::{Answer, Heartbeat, NetworkPages, SensorPage, SkinSensors, State, StimulusStart};
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::{Events, LinksDown, MAX_JOINTS, Parameter, Parameters};
 use protocol::skin::{self, SafetyLimits};
@@ -222,10 +220,9 @@ impl CellState {
             && claim.has_state(State::CONFIGURED)
     }
 
-    /// Returns the newest sensor values by the stimuli and pages received; the default for unknown ones.
-    #[must_use]
-    pub fn readings(&self) -> SensorReadings {
-        self.contact.readings()
+    /// Returns the newest sensors pages by the stimuli and pages received.
+    pub fn latched_pages(&self) -> impl Iterator<Item = SensorPage> {
+        self.contact.latched_pages().map(|(page, ())| page)
     }
 
     /// Records a stimulus on the bus; `last` is the epoch of the last joints.

@@ -10,7 +10,7 @@
 //!   129 joints; then a stimulus, or the cell's page ──> earlier stimuli are latched and replaced
 //! ```
 
-use protocol::message::{SensorPage, SensorReadings, SkinSensors, StimulusStart};
+use protocol::message::{SensorPage, SkinSensors, StimulusStart};
 use protocol::packet::Epoch;
 
 /// Maximum number of pending stimuli in a cell.
@@ -185,14 +185,6 @@ impl<T> ContactState<T> {
     pub fn latched_pages(&self) -> impl Iterator<Item = (SensorPage, &T)> {
         let skin = self.skin.iter().map(|(skin, tag)| (SensorPage::Skin(*skin), tag));
         skin.chain(self.others.iter().flatten().map(|(page, tag)| (*page, tag)))
-    }
-
-    /// Returns the values of all latched or reported pages, and the default of others.
-    #[must_use]
-    pub fn readings(&self) -> SensorReadings {
-        let mut readings = SensorReadings::default();
-        self.latched_pages().for_each(|(page, _)| readings.set_page(&page));
-        readings
     }
 
     /// Returns the pending stimuli in order, each with the joints at which the cell latches it.

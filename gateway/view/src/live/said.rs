@@ -4,7 +4,7 @@ use bench::remote::BenchState;
 use model::table::{CellStatus, FrameEvent};
 use protocol::fixed::is_saturated;
 use protocol::id::{Id, Kind};
-use protocol::message::{SensorPage, SensorReadings};
+use protocol::message::SensorPage;
 use protocol::parameters::Contact;
 use protocol::quantiles::Quantiles;
 use protocol::schema::{FieldFormat, PacketSchema};
@@ -143,10 +143,10 @@ pub struct CellDetail {
     pub configuration: [Option<String>; 2],
     /// The gains and thresholds of the cell, from the skin.
     pub gains: GainsAndThresholds,
-    /// The fields of its sensors pages.
+    /// The fields of its sensors pages, without pages that nobody has sent.
     pub readings: Vec<SensorReading>,
-    /// Its force by Algorithm 1, in N.
-    pub force_n: f64,
+    /// Its force by Algorithm 1, in N; null if its sensor values are unknown.
+    pub force_n: Option<f64>,
     /// The last torque that the cell sent.
     pub torque: Option<TorqueReply>,
     /// The number of replies that were due, and the number that came in time.
@@ -270,8 +270,7 @@ impl LiveState {
         let place = bus.table.index_of(id)?;
         let cell = bus.table.cells().get(place)?;
         let (sensors, status) = bus.table.presumed_sensors(now).nth(place)?;
-        let sensors = sensors.unwrap_or_default();
-        let force_n = bus.central.cell_force(place, &sensors);
+        let force_n = sensors.map(|sensors| bus.central.cell_force(place, &sensors));
         let torque = bus.last.get(place).copied().flatten().map(|(received, epoch, words)| {
             let words = words.as_slice();
             let frames = bus.joint_positions_in(epoch).map(|positions| bus.central.link_frames(&positions));
@@ -285,7 +284,7 @@ impl LiveState {
                 at_s: self.seconds_since_start(received),
                 words: words.iter().take(joints).copied().collect(),
                 distributed: words.iter().take(joints).map(|&word| bus.torque_format.to_real(word)).collect(),
-                central: at(force_n),
+                central: force_n.and_then(at),
                 jacobian: at(1.0),
                 saturated: words.iter().any(|&word| is_saturated(word)),
             }
@@ -304,9 +303,10 @@ impl LiveState {
                 Some(hash(cell.configuration)),
             ],
             gains: GainsAndThresholds::from_contact(skin_cell.contact),
-            readings: SensorReadings { skin: sensors, ..cell.readings() }
-                .simulated_pages()
+            readings: sensors
+                .map(SensorPage::Skin)
                 .into_iter()
+                .chain(cell.latched_pages().filter(|page| !matches!(page, SensorPage::Skin(_))))
                 .flat_map(SensorReading::fields_of_page)
                 .collect(),
             force_n,

@@ -116,9 +116,13 @@ fn a_snapshot_holds_the_last_epoch_that_is_over() {
     assert_eq!((answer.epoch, answer.words[..2].to_vec(), detail.serial), (2, vec![100, -200], 100_005));
     let exact = answer.central.unwrap();
     let jacobian = answer.jacobian.unwrap();
+    let force_n = detail.force_n.unwrap();
     for (torque, row) in exact.iter().zip(&jacobian) {
-        assert!((torque - row * detail.force_n).abs() < 1e-9, "tau = J F: {exact:?} {jacobian:?}");
+        assert!((torque - row * force_n).abs() < 1e-9, "tau = J F: {exact:?} {jacobian:?}");
     }
+    assert_eq!(detail.readings.len(), 3, "no page of acceleration was sent: {:?}", detail.readings);
+    let unknown = bench.live.cell_detail(&selected("7"), bench.now).unwrap();
+    assert_eq!((unknown.force_n, unknown.readings), (None, vec![]), "never heard");
     let contact = bench.live.skin.cells[4].contact;
     assert_eq!(detail.gains.alpha[0], contact.alpha_c.to_f64());
     assert_eq!(detail.gains.thresholds[2], contact.force_threshold.to_f64());
