@@ -207,7 +207,7 @@ fn format_signed_steps(steps: i32) -> String {
 /// Returns the rank of a verdict by importance, its name, and an explanation if it needs one.
 fn verdict_info(verdict: &WordVerdict) -> (u8, &'static str, Option<String>) {
     match verdict {
-        WordVerdict::Nearest => (0, "nearest", None),
+        WordVerdict::Nearest => (0, "nearest", Some("the word is the step nearest to J F_z".to_owned())),
         WordVerdict::Rounded { .. } => {
             let means =
                 "a Jacobian J that is this many steps of 2^-14 m off, by 16-bit rounding, gives this word";
@@ -255,7 +255,7 @@ fn format_cell_steps(cell: &CellExplanation, zero: u64) -> String {
     let mut text = format!("\n{}, on the link that joint {} moves\n", name(cell), cell.joint);
     match &cell.force {
         Some(force) => text += &format_force_steps(force, zero),
-        None => text += "  contact    not known\n",
+        None => text += "  sensors    not known\n",
     }
     match cell.answered_after_ns {
         Some(nanos) => text += &format!("  answered   {} after the joints message\n", format_millis(nanos)),
@@ -269,8 +269,8 @@ fn format_force_steps(force: &ForceSteps, zero: u64) -> String {
         contact_n: [a, b, c], proximity, touch_n, contact_threshold_n, proximity_threshold, ..
     } = *force;
     let ForceSteps { alpha_c, alpha_p_n, fused_n, force_threshold_n, force_steps, force_n, .. } = *force;
-    let counts = |counts: bool| if counts { "counts" } else { "none" };
-    let against = |value: f64, threshold: f64| if value < threshold { "below" } else { "not below" };
+    let counts = |counts: bool| if counts { "counts" } else { "does not count" };
+    let against = |value: f64, threshold: f64| if value < threshold { "below" } else { "at least" };
     let touch = against(touch_n, contact_threshold_n);
     let near = against(proximity, proximity_threshold);
     let fused = against(fused_n, force_threshold_n);
@@ -278,11 +278,12 @@ fn format_force_steps(force: &ForceSteps, zero: u64) -> String {
     let [touch_counts, near_counts] =
         [touch_n >= contact_threshold_n, proximity >= proximity_threshold].map(counts);
     format!(
-        "  contact    {a:.4} + {b:.4} + {c:.4} N, proximity {proximity:.4}\n  \
+        "  sensors    contact {a:.4} + {b:.4} + {c:.4} N, proximity {proximity:.4}\n  \
          since      {origin}\n  \
-         F_c        {touch_n:.4} N, {touch} {contact_threshold_n:.4} N: {touch_counts}\n  \
-         F_p        {proximity:.4}, {near} {proximity_threshold:.4}: {near_counts}\n  \
-         F_z        {alpha_c:.4} F_c + {alpha_p_n:.4} F_p = {fused_n:.6} N, {fused} {force_threshold_n:.4} N\n  \
+         contact    F_c = {touch_n:.4} N, {touch} its threshold of {contact_threshold_n:.4} N: {touch_counts}\n  \
+         proximity  F_p = {proximity:.4}, {near} its threshold of {proximity_threshold:.4}: {near_counts}\n  \
+         force      F_z = {alpha_c:.4} F_c + {alpha_p_n:.4} F_p = {fused_n:.6} N, {fused} its threshold of \
+         {force_threshold_n:.4} N\n  \
          in words   {force_steps} steps of 2^-16 N = {force_n:.6} N\n"
     )
 }
@@ -316,7 +317,10 @@ fn format_joint_rows(cells: &[CellExplanation], by_cell: bool) -> String {
     let first = if by_cell { names.column_heading() } else { "joint".to_owned() };
     let mut head = vec![first];
     head.extend(by_cell.then(|| "F_z N".to_owned()));
-    head.extend(["J m", "J F_z Nm", "nearest", "word", "Nm", "steps", "verdict"].map(str::to_owned));
+    head.extend(
+        ["lever\nJ, m", "J F_z,\nNm", "nearest\nword", "word\nsent", "sent,\nNm", "steps\noff", "verdict"]
+            .map(str::to_owned),
+    );
     let line = |cell: &CellExplanation, row: &TorqueRow| {
         let mut line = vec![if by_cell { names.name_of_cell(cell) } else { joint_name(row.joint, row.unit) }];
         line.extend(by_cell.then(|| format_decimals(force_n(cell), 2, "?")));

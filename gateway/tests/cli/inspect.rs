@@ -252,11 +252,11 @@ fn the_worked_example_of_the_document_is_explained_in_a_terminal() {
     let text = output(folder, "explain run.log --skin skin.toml --epoch 7 --cell 12");
     for line in [
         "run.log: joints message of epoch 7 on vcan0, 0.200000 s after the first frame",
-        "  contact    1.0000 + 1.0000 + 1.0000 N, proximity 0.0000",
+        "  sensors    contact 1.0000 + 1.0000 + 1.0000 N, proximity 0.0000",
         "  since      the stimulus at 0.100000 s, in effect from the next joints message on",
-        "  F_c        3.0000 N, not below 0.1006 N: counts",
-        "  F_p        0.0000, below 0.0500: none",
-        "  F_z        1.0000 F_c + 0.0000 F_p = 3.000000 N, not below 0.1006 N",
+        "  contact    F_c = 3.0000 N, at least its threshold of 0.1006 N: counts",
+        "  proximity  F_p = 0.0000, below its threshold of 0.0500: does not count",
+        "  force      F_z = 1.0000 F_c + 0.0000 F_p = 3.000000 N, at least its threshold of 0.1006 N",
         "  in words   196608 steps of 2^-16 N = 3.000000 N",
         "  answered   0.500 ms after the joints message",
         "  vcan0 12: it did not report its configuration hash, which is assumed to be that of the skin, 266D",

@@ -131,7 +131,7 @@ fn explain_dump_and_report_take_a_part_and_all_of_them() {
     let epoch = &torque["epoch"];
     let ended = place.start("skinbus", &format!("explain {last} --epoch {epoch} --cell 1")).end().succeeded();
     assert!(
-        ended.stdout.contains("contact    0.6") && ended.stdout.contains("stimulus at -0.0"),
+        ended.stdout.contains("sensors    contact 0.6") && ended.stdout.contains("stimulus at -0.0"),
         "{ended:#?}"
     );
     assert!(!ended.stdout.contains("not known"), "{ended:#?}");
