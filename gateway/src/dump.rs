@@ -58,7 +58,7 @@ pub(crate) struct DumpCommand {
     /// sync, resume, report
     #[arg(long, value_name = "KIND", value_delimiter = ',')]
     kind: Vec<FrameSelector>,
-    /// Show only packets from or to these nodes: a node id, gateway or everyone
+    /// Show only packets from or to these nodes: a node id, BUS:NODE, gateway or everyone
     #[arg(long, value_name = "[BUS:]NODE", value_delimiter = ',')]
     cell: Vec<NodeSelector>,
     /// Show only frames of these buses
@@ -122,6 +122,7 @@ const ANY_FORMAT: &[OptionValue<PacketFormat>] = &[
 impl DumpCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let is_capture = self.is_capture()?;
+        self.check_no_skin()?;
         let mut title = comma_separated(self.sources.iter().map(|source| source.display()));
         let out = io::stdout();
         let colour = output::is_coloured(&out);
@@ -179,9 +180,6 @@ impl DumpCommand {
             }
             reader.extras().run_began().into_iter().for_each(|zero| show.set_zero_time(zero));
             let done = show_capture(&mut reader, &mut show);
-            if let (Ok(()), Some(absent)) = (&done, show.absent_buses()) {
-                output::print_note(format_args!("{title} contains no frame of {absent}"));
-            }
             (input::format_name(&reader), Some(reader.extras().clone()), done)
         } else {
             // Signals must be caught before the dump reports that it listens.
@@ -193,6 +191,13 @@ impl DumpCommand {
             ("live", None, show_live(&mut receive_ends, &mut show, self.to, &stopped))
         };
         ignore_broken_pipe(show.finish().and_then(|()| show.flush()))?;
+        if let (Ok(()), Some(absent)) = (&done, show.absent_names()) {
+            output::print_note(if is_capture {
+                format!("{title} contains no frame of {absent}")
+            } else {
+                format!("no frame of {absent} came")
+            });
+        }
         let report = show.report();
         drop(show);
         if let Some(report) = report {
@@ -203,6 +208,22 @@ impl DumpCommand {
             })?;
         }
         done
+    }
+
+    /// Refuses a skin, whose buses may have been meant.
+    fn check_no_skin(&self) -> Result<(), Failure> {
+        let is_toml = |path: &&PathBuf| is_file(path) && path.extension().is_some_and(|end| end == "toml");
+        let Some((file, skin)) =
+            self.sources.iter().find(is_toml).and_then(|it| Some((it, Skin::read(it).ok()?)))
+        else {
+            return Ok(());
+        };
+        let (file, buses) =
+            (file.display(), skin.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>());
+        Err(Failure::usage_error(format!(
+            "{file} is a skin, which contains no frames; its buses are followed by `skinbus dump {} --skin {file}`",
+            buses.join(" ")
+        )))
     }
 
     /// Returns true if the sources are a capture, false if they are buses.

@@ -347,7 +347,7 @@ impl BusReceiver {
         options: BusOptions,
     ) -> Result<Self, BusError> {
         let bus = listen::open_bus(name, kind, format, BusOptions { error_mask: EXTENDED_MASK, ..options })?;
-        output::print_note(format_args!("{}: bus of kind {}", bus.name(), bus.kind()));
+        output::print_note(format_args!("listening on {}, a bus of kind {}", bus.name(), bus.kind()));
         Ok(Self { bus, follower: Follower::default() })
     }
 

@@ -7,13 +7,14 @@ use std::sync::Arc;
 
 use analysis::explain::other_robot_text;
 use analysis::stats::{CaptureStats, StatsReport};
-use model::decode::pick::FrameFilter;
+use model::decode::pick::{FrameFilter, NodeSelector};
 use model::decode::settle::OrderedDecoder;
 use model::decode::{Decoded, json};
 use protocol::can::{Format, Frame};
 use protocol::candump::{Direction, Record, Timestamp};
 use protocol::id::Kind;
 use protocol::message::Message;
+use protocol::packet::data_frame_id;
 use protocol::schema::BusUnits;
 use protocol::skin::Skin;
 use protocol::time::Micros;
@@ -66,6 +67,8 @@ pub(super) struct FrameOutput<W> {
     remaining: u64,
     /// Buses named by the filters from which no frame has come.
     absent: Vec<String>,
+    /// Nodes named by the filters from or to which no frame has come.
+    absent_nodes: Vec<NodeSelector>,
     /// Start of the counted seconds, in ns since 1970; `None` until it is known or the first frame comes.
     zero: Option<u64>,
     raw: String,
@@ -81,10 +84,12 @@ impl<W: Write> FrameOutput<W> {
         max: u64,
     ) -> Self {
         let absent = pick.bus_names().map(str::to_owned).collect();
+        let absent_nodes = pick.parties.clone();
         Self {
             out,
             settler: OrderedDecoder::new(format),
             absent,
+            absent_nodes,
             bus: Arc::from(""),
             units: BusUnits::default(),
             described: Vec::new(),
@@ -150,6 +155,12 @@ impl<W: Write> FrameOutput<W> {
             && let Some((PendingFrame { time, bus, units, frame, direction }, decoded)) = self.settler.pop()
         {
             self.check_joint_count(&bus, &decoded);
+            if !self.absent_nodes.is_empty()
+                && let Ok(id) = data_frame_id(&frame)
+                && !matches!(decoded, Decoded::Foreign(_))
+            {
+                self.absent_nodes.retain(|node| !node.matches(id, &bus));
+            }
             let is_described = self.described.iter().any(|(name, ..)| **name == *bus);
             let units = if is_described { units } else { BusUnits::default() };
             self.show(&Record { time, interface: &bus, frame, direction }, &decoded, units)?;
@@ -157,9 +168,12 @@ impl<W: Write> FrameOutput<W> {
         Ok(())
     }
 
-    /// Returns the names of the buses that the options name but from which no frame came.
-    pub(super) fn absent_buses(&self) -> Option<String> {
-        (!self.absent.is_empty() && self.remaining > 0).then(|| comma_separated(&self.absent))
+    /// Returns the names of the buses and nodes that the options name but of which no frame came.
+    pub(super) fn absent_names(&self) -> Option<String> {
+        let is_on_absent = |it: &&NodeSelector| it.bus.as_ref().is_some_and(|bus| self.absent.contains(bus));
+        let nodes = self.absent_nodes.iter().filter(|it| !is_on_absent(it)).map(|it| format!("node {it}"));
+        let names: Vec<_> = self.absent.iter().cloned().chain(nodes).collect();
+        (!names.is_empty() && self.remaining > 0).then(|| comma_separated(&names))
     }
 
     /// Returns true if no further frames are to be shown.

@@ -261,10 +261,14 @@ fn dump_shows_a_foreign_log_as_foreign_in_its_order() {
         assert!(shown.lines().all(|line| line.split('\t').nth(1).unwrap().starts_with("foreign ")));
     }
     let kinds = "command,sum,torque,sensors,network,configure,configured,stimulus,wire,damaged";
-    for pick in [format!("--kind {kinds}"), "--cell gateway,everyone,1,12".to_owned(), "--contact".to_owned()]
-    {
+    for pick in [format!("--kind {kinds}"), "--contact".to_owned()] {
         assert_eq!(gateway(folder, &format!("dump car.log {pick}")), "", "{pick}");
     }
+    let mut nodes = Command::new(env!("CARGO_BIN_EXE_skinbus"));
+    let Output { status, stdout, stderr } =
+        nodes.args(["dump", "car.log", "--cell", "gateway,12"]).current_dir(folder).output().unwrap();
+    assert_eq!((status.code(), stdout.as_slice()), (Some(0), &b""[..]));
+    assert_eq!(stderr, b"car.log contains no frame of node gateway, node 12\n");
     let json = gateway(folder, "dump car.log --json");
     for line in json.lines() {
         let line: Value = serde_json::from_str(line).unwrap();

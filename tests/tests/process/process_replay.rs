@@ -383,7 +383,7 @@ fn a_foreign_capture_goes_to_another_bus_as_it_is() {
     let server = place.start("vcan-setup", "serve vcan0");
     server.wait_for_stdout("serving vcan0 at ");
     let dump = place.start("skinbus", "dump vcan0 --bus-kind embedded -n 4");
-    dump.wait_for_stderr("vcan0: bus of kind embedded");
+    dump.wait_for_stderr("vcan0, a bus of kind embedded");
     let (ended, replayed) = place.replayed("foreign.log", "--map can7=vcan0 --map can8=vcan0");
     ended.succeeded();
     let ended = dump.end().succeeded();

@@ -46,7 +46,7 @@ fn frames_are_stamped_with_their_ends_and_refused_when_the_queue_is_full() {
     let (sender, listener) = (open(&place), open(&place));
     assert!(sender.is_timed() && listener.is_timed());
     let fit = place.start("skinbus", "fit vcan0 --bus-kind embedded");
-    fit.wait_for_stderr("vcan0: bus of kind embedded");
+    fit.wait_for_stderr("vcan0, a bus of kind embedded");
     // A program of version 2 gets the same frames without stamps.
     let older = seqpacket_socket(SocketFlags::empty()).unwrap();
     rustix::net::connect(&older, &socket_address(&place.buses(), "vcan0").unwrap()).unwrap();

@@ -1,5 +1,6 @@
 //! Filters that select frames to show.
 
+use core::fmt;
 use core::str::FromStr;
 
 use protocol::can::{EXTENDED_MASK, Frame, STANDARD_MASK};
@@ -74,6 +75,37 @@ pub struct NodeSelector {
     pub bus: Option<String>,
     /// The node on that bus.
     pub node: Node,
+}
+
+impl NodeSelector {
+    /// Returns true if a packet with this identifier, on this bus, is from or to the node.
+    #[must_use]
+    pub fn matches(&self, id: Id, bus: &str) -> bool {
+        let node = match id.kind {
+            Kind::Command => Node::Gateway,
+            Kind::Sum
+            | Kind::Torque
+            | Kind::Sensors
+            | Kind::Network
+            | Kind::Configure
+            | Kind::Configured
+            | Kind::Stimulus => Node::from_byte(id.node),
+        };
+        self.node == node && self.bus.as_ref().is_none_or(|it| it == bus)
+    }
+}
+
+impl fmt::Display for NodeSelector {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if let Some(bus) = &self.bus {
+            write!(f, "{bus}:")?;
+        }
+        match self.node {
+            Node::Gateway => f.write_str("gateway"),
+            Node::Everyone => f.write_str("everyone"),
+            Node::Cell(cell) => write!(f, "{cell}"),
+        }
+    }
 }
 
 impl FromStr for NodeSelector {
@@ -207,19 +239,7 @@ impl FrameFilter {
     }
 
     fn matches_node(&self, id: Option<Id>, bus: &str) -> bool {
-        let node = id.map(|id| match id.kind {
-            Kind::Command => Node::Gateway,
-            Kind::Sum
-            | Kind::Torque
-            | Kind::Sensors
-            | Kind::Network
-            | Kind::Configure
-            | Kind::Configured
-            | Kind::Stimulus => Node::from_byte(id.node),
-        });
-        let is =
-            |party: &NodeSelector| Some(party.node) == node && party.bus.as_ref().is_none_or(|it| it == bus);
-        self.parties.is_empty() || self.parties.iter().any(is)
+        self.parties.is_empty() || id.is_some_and(|id| self.parties.iter().any(|it| it.matches(id, bus)))
     }
 }
 

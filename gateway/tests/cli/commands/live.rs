@@ -49,9 +49,10 @@ impl Bench {
     fn dump(&self, arguments: &str) -> Child {
         let mut command = self.gateway(&format!("dump vcan0 {arguments}"));
         let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-        let mut line = [0; 28];
+        let expected = "listening on vcan0, a bus of kind embedded\n";
+        let mut line = vec![0; expected.len()];
         child.stderr.as_mut().unwrap().read_exact(&mut line).unwrap();
-        assert_eq!(text(&line), "vcan0: bus of kind embedded\n");
+        assert_eq!(text(&line), expected);
         child
     }
 
@@ -369,12 +370,21 @@ fn what_the_options_of_a_dump_leave_out_is_said() {
         let Output { status, stderr, .. } = bench.gateway(&format!("dump {arguments}")).output().unwrap();
         assert_eq!((status.code(), text(&stderr)), (Some(2), expected));
     }
+    let skin = bench.parent.path().join("two.toml").display().to_string();
+    output(gateway(&format!("skin generate --cells 6 --buses 2 -o {skin}")));
+    let Output { status, stderr, .. } = gateway(&format!("dump {skin}")).output().unwrap();
+    let expected = format!(
+        "skinbus: {skin} is a skin, which contains no frames; its buses are followed by `skinbus dump vcan0 vcan1 --skin {skin}`\n"
+    );
+    assert_eq!((status.code(), text(&stderr)), (Some(2), expected.as_str()));
     let log = bench.parent.path().join("run.log");
     std::fs::write(&log, "(1.000000) vcan0 003##500000000000000000000000000004782\n").unwrap();
     let log = log.display().to_string();
-    for (arguments, expected) in
-        [("--bus vcan3", "contains no frame of vcan3"), ("--cell vcan3:1", "contains no frame of vcan3")]
-    {
+    for (arguments, expected) in [
+        ("--bus vcan3", "contains no frame of vcan3"),
+        ("--cell vcan3:1", "contains no frame of vcan3"),
+        ("--cell vcan0:99,98", "contains no frame of node vcan0:99, node 98"),
+    ] {
         let Output { status, stdout, stderr } = gateway(&format!("dump {log} {arguments}")).output().unwrap();
         let expected = format!("{log} {expected}\n");
         assert_eq!((status.code(), text(&stdout), text(&stderr)), (Some(0), "", expected.as_str()));
