@@ -16,7 +16,8 @@ pub(crate) const RESET_COLOUR: &str = "\x1b[0m";
 
 /// Indent of a name that is kept when the name takes two lines.
 const NAME_INDENT: &str = "\u{a0}";
-/// Maximum width of a table in columns.
+/// Bounds of the width of a table in columns. A terminal may report 0 columns, which says nothing.
+const MIN_TABLE_WIDTH: u16 = 40;
 const MAX_TABLE_WIDTH: u16 = 110;
 /// Maximum width of a row's name in one line.
 const MAX_NAME_WIDTH: u16 = 36;
@@ -119,9 +120,14 @@ pub(crate) fn table<H: Into<String>>(
 }
 
 /// Limits a table to the width of the terminal, and to a readable width.
-pub(crate) fn limit_width(mut table: Table) -> Table {
-    let width = table.width().map_or(MAX_TABLE_WIDTH, |width| width.min(MAX_TABLE_WIDTH));
-    table.set_width(width);
+pub(crate) fn limit_width(table: Table) -> Table {
+    limit_width_to(table, MAX_TABLE_WIDTH)
+}
+
+/// Limits a table to the width of the terminal, and to `max` columns.
+pub(crate) fn limit_width_to(mut table: Table, max: u16) -> Table {
+    let terminal = table.width().filter(|width| *width > 0);
+    table.set_width(terminal.map_or(max, |width| width.clamp(MIN_TABLE_WIDTH, max)));
     table
 }
 
@@ -301,6 +307,16 @@ fn fold_name(name: &str, width: Option<usize>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_terminal_without_columns_says_nothing_about_the_width() {
+        let limited = |terminal| {
+            let mut table = Table::new();
+            table.set_width(terminal);
+            limit_width_to(table, 80).width()
+        };
+        assert_eq!([0, 7, 60, 200].map(limited), [80, 40, 60, 80].map(Some));
+    }
 
     #[test]
     fn a_long_text_hangs_under_its_begin() {

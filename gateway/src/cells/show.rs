@@ -102,7 +102,7 @@ impl<'a> CellList<'a> {
     pub(super) fn table(&self) -> String {
         let whole = self.lines(COLUMNS.into_iter().chain(COUNTER_COLUMNS));
         let text = match Table::new().width() {
-            Some(wide) if width(&whole) > usize::from(wide) => self.lines(COLUMNS),
+            Some(wide) if wide > 0 && width(&whole) > usize::from(wide) => self.lines(COLUMNS),
             _ => whole,
         };
         text + &self.format_totals()

@@ -13,7 +13,7 @@ use protocol::usage::printable;
 
 use crate::junit::{Outcome, TestCase, TestSuite};
 use crate::print::{
-    abbreviate_names, comma_separated, count_with_noun, format_decimals, or_else_text, table,
+    abbreviate_names, comma_separated, count_with_noun, format_decimals, limit_width_to, or_else_text, table,
 };
 
 /// Width of the tables in columns.
@@ -115,7 +115,7 @@ impl ComparisonText<'_> {
             max_steps: joints.max_steps,
             ..ReplyCounts::default()
         };
-        row("joints", none(), none(), replies_text(&only_joints));
+        row("joints messages", none(), none(), replies_text(&only_joints));
         let touched = [contacts.only.only_a, contacts.only.only_b].map(|only| contacts.both + only);
         let [in_a, in_b] = touched.map(|touched| touched.to_string());
         row("cells touched, per epoch", in_a, in_b, format!("{} in both", contacts.both));
@@ -149,10 +149,8 @@ impl ComparisonText<'_> {
                 row(name, of(a).to_string(), of(b).to_string(), information());
             }
         }
-        let mut table = table(["", "A", "B", "compared"], rows, |column| column == 1 || column == 2);
-        if table.width().is_none_or(|width| width > TABLE_WIDTH) {
-            table.set_width(TABLE_WIDTH);
-        }
+        let table = table(["", "A", "B", "compared"], rows, |column| column == 1 || column == 2);
+        let table = limit_width_to(table, TABLE_WIDTH);
         format!("{table}\n")
     }
 
@@ -171,10 +169,7 @@ impl ComparisonText<'_> {
                 [name].into_iter().chain(numbers.map(|number| number.to_string())).collect::<Vec<_>>()
             });
             let head = ["cell", "different", "max steps", "missing in A", "missing in B"];
-            let mut table = table(head, rows, |column| column > 0);
-            if table.width().is_none_or(|width| width > TABLE_WIDTH) {
-                table.set_width(TABLE_WIDTH);
-            }
+            let table = limit_width_to(table(head, rows, |column| column > 0), TABLE_WIDTH);
             let _ = writeln!(text, "{table}");
             if total > MAX_LISTED_CELLS {
                 let _ = writeln!(
