@@ -197,7 +197,9 @@ impl ConvertCommand {
             }
             print_note(said);
         }
-        sink.finish().or_else(|(left, error)| write_error(&self.to, &left, error))?;
+        if let Err((left, error)) = sink.finish() {
+            return write_error(&self.to, &left, error);
+        }
         for line in remarks(&reader, &done, &style, text) {
             print_note(format_args!("{name}: {line}"));
         }
@@ -439,7 +441,8 @@ fn progress_bar(size: Option<u64>) -> ProgressBar {
 /// Returns the notes on a conversion, one per line.
 fn remarks(reader: &Reader, done: &ConversionCounts, style: &LogStyle, text: bool) -> Vec<String> {
     let mut lines = reader.remarks();
-    let how = if style.plain { "" } else { ": some tools cannot read it; add --direction to write it" };
+    let how =
+        if style.plain { "" } else { ", which some tools cannot read; --direction adds the directions" };
     let LossCounts { digits, direction, raw_dlc, name } = done.shortened;
     let written = ["frame was written", "frames were written"];
     for (count, [one, more], what) in [
@@ -456,7 +459,7 @@ fn remarks(reader: &Reader, done: &ConversionCounts, style: &LogStyle, text: boo
         (done.can_xl, ["is a CAN XL frame", "are CAN XL frames"], ": not read"),
         (done.dropped, ["frame is missing", "frames are missing"], ": lost by the recorder"),
         (digits, written, " without the digits of the time below 1 us"),
-        (direction, written, &format!(" without their direction{how}")),
+        (direction, written, &format!(" without a direction, T or R{how}")),
         (raw_dlc, written, " without their raw DLC"),
         (
             name,

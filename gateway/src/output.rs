@@ -86,7 +86,13 @@ pub(crate) fn write_and_finish(
 
 /// Returns the error for a file that cannot be written, which counts as wrong use.
 pub(crate) fn write_refused_failure(option: &str, path: &Path, error: &io::Error) -> Failure {
-    Failure::usage_error(format!("{}: {error}", option_and_path(option, path)))
+    let text = format!("{}: {error}", option_and_path(option, path));
+    // A full disk is no wrong use.
+    if error.kind() == io::ErrorKind::StorageFull {
+        Failure::run_error(text)
+    } else {
+        Failure::usage_error(text)
+    }
 }
 
 fn option_and_path(option: &str, path: &Path) -> String {
