@@ -64,7 +64,8 @@ fn its_program_takes_its_place_with_the_same_words_exit_code_and_signals() {
     for (name, signal) in [("an odd place", Signal::TERM), ("interrupted", Signal::INT)] {
         // A shell that is interrupted before `exec` ends with an exit code. Tests in the background of a shell ignore SIGINT.
         place.write("ready", "ready\n");
-        let script = place.script(name, "#!/bin/sh\nexec env --default-signal tail -f ready\n");
+        let script =
+            place.script(name, "#!/bin/sh\nexec /usr/bin/env --default-signal /usr/bin/tail -f ready\n");
         let mut link = command(&place, &program("vcan-setup"), "link vcan0");
         let link = Running::start({
             link.env("SKINBUS_VCAN_LINK", script);
