@@ -1,5 +1,6 @@
 //! Arguments that several commands share, and parsers of their values.
 
+use std::net::SocketAddr;
 use std::ops::RangeInclusive;
 
 use bench::bus::time::BusTimeChoice;
@@ -55,6 +56,14 @@ pub(crate) fn parse_time_ns(text: &str) -> Result<u64, String> {
     let seconds = parse_time(text).filter(|seconds| (0.0..=1e9).contains(seconds));
     let nanos = seconds.map(|seconds| (seconds * 1e9).round() as u64);
     nanos.ok_or_else(|| "use a time from 0 s to 1e9 s, such as 10, 500ms, 90s, 10min or 2h".to_owned())
+}
+
+/// Parses the address at which a page is served.
+pub(crate) fn parse_address(text: &str) -> Result<SocketAddr, String> {
+    text.parse().map_err(|_| {
+        "use an IP address and a port, such as 127.0.0.1:8100 or [::1]:8100; port 0 is any free one"
+            .to_owned()
+    })
 }
 
 /// The option for the kinds of one or several buses.

@@ -29,7 +29,7 @@ use trace::recording::series::{AttachedFile, SplitLimits};
 
 use super::arguments::{
     BusKinds, BusTimeOption, ProcessOptions, bus_names, cells_per_process, environment_number, find_cell,
-    parse_duration, parse_time,
+    parse_address, parse_duration, parse_time,
 };
 use super::buses;
 use super::output::{self, OverwriteOption, check_distinct_files, print_note, print_table};
@@ -68,7 +68,7 @@ struct CommonOptions {
     #[arg(long)]
     view: bool,
     /// Address at which the page is served [default: any free port of this machine]
-    #[arg(long, value_name = "ADDRESS:PORT", requires = "view")]
+    #[arg(long, value_name = "ADDRESS:PORT", value_parser = parse_address, requires = "view")]
     listen: Option<SocketAddr>,
     #[command(flatten)]
     recording: RecordingArguments,
@@ -178,7 +178,7 @@ pub(crate) struct DemoCommand {
 /// duration, and prints a table of results. Ctrl-C ends the run early, with the table. The sockets of embedded buses
 /// are in SKINBUS_DIR, if that is set: give benches that run side by side a directory each. Exit code 0: the run came
 /// to its end; 1: it ended early, a bus was lost at its end, or its recording is incomplete; 2: wrong use or
-/// configuration; 3: the robot was halted at the end; 4: the external controller was absent; 5: a process of cells
+/// configuration; 3: the robot was halted at the end; 4: the external controller was absent, but had not halted it; 5: a process of cells
 /// failed.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:

@@ -26,7 +26,7 @@ use view::serve::{ServeError, ServeOptions, serve};
 use view::server::{PageAccess, page_url};
 use view::{RowMesh, Token};
 
-use super::arguments::{BusKinds, bus_names, find_bus, parse_time_ns};
+use super::arguments::{BusKinds, bus_names, find_bus, parse_address, parse_time_ns};
 use super::input::{no_frame_failure, note_skin_difference, read_skin, skin_of_recording, stop_flag};
 use super::output::print_note;
 use super::robot_file::{SkinRobot, urdf_path};
@@ -70,7 +70,7 @@ pub(crate) struct ViewCommand {
     #[arg(long, value_name = "S", value_parser = parse_time_ns)]
     at: Option<u64>,
     /// Address at which the page is served; port 0 stands for any free port
-    #[arg(long, value_name = "ADDRESS:PORT", default_value_t = DEFAULT_ADDRESS)]
+    #[arg(long, value_name = "ADDRESS:PORT", value_parser = parse_address, default_value_t = DEFAULT_ADDRESS)]
     listen: SocketAddr,
     /// Read the secret token of the page's address from this file [default: the variable SKINBUS_TOKEN, else a random
     /// token]

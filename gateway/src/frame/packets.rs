@@ -67,10 +67,10 @@ struct Angles {
   skinbus frame stimulus --cell everyone --epoch 7 --force 0.5 --proximity 0.9
   skinbus frame stimulus --cell 12 --acceleration 0 0 1")]
 pub(super) struct StimulusCommand {
-    /// Cell that receives the packet, or everyone
+    /// Cell that receives the packet; `everyone` for all cells
     #[arg(long, value_name = "[BUS:]NODE", value_parser = addressee)]
     cell: NodeSelector,
-    /// Force of the touch in N, divided among the cell's three contact sensors
+    /// Force of the touch, -96 to 95.997 N, divided among the cell's three contact sensors
     #[arg(long, value_name = "N", allow_negative_numbers = true)]
     force: Option<String>,
     /// Proximity from 0 (nothing near) to 1
@@ -115,7 +115,7 @@ pub(super) struct StimulusCommand {
   skinbus frame configure --cell 12 --write 99 1 -1 0x7FFF"
 )]
 pub(super) struct ConfigureCommand {
-    /// Cell that receives the packet, or everyone
+    /// Cell that receives the packet; `everyone` for all cells
     #[arg(long, value_name = "[BUS:]NODE", value_parser = addressee)]
     cell: NodeSelector,
     #[command(flatten)]

@@ -31,7 +31,7 @@ pub(super) struct SensingCommand {
     /// Rate in continuous mode, in frames per second and cell
     #[arg(value_name = "HZ", allow_negative_numbers = true)]
     hz: Option<f64>,
-    /// Cell that receives the packet, or everyone
+    /// Cell that receives the packet; `everyone` for all cells
     #[arg(long, value_name = "[BUS:]NODE", value_parser = addressee, default_value = "everyone")]
     pub(super) cell: NodeSelector,
 }

@@ -127,7 +127,7 @@ fn add_accuracy_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bo
     if single {
         let errors = &accuracy.single;
         rows.add_row(
-            name("single cells", "single cells, loaded joints"),
+            name("each cell", "each cell, joints it loads"),
             format_mean_and_max(errors),
             of_paper(errors, paper::SINGLE_CELL_ERROR_NM),
         );
@@ -151,7 +151,7 @@ fn add_accuracy_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bo
     if sums {
         let errors = &accuracy.sums;
         rows.add_row(
-            name("sums", "sums, loaded joints"),
+            name("sums", "sums, joints they load"),
             format_mean_and_max(errors),
             of_paper(errors, paper::SUMMED_ERROR_NM),
         );
@@ -223,7 +223,7 @@ fn add_control_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: boo
 
 fn add_reply_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     let replies = &bus.replies;
-    rows.add_section(&bus.name, frames::cells_by_status(&bus.cells), format!("{} bus", bus.kind));
+    rows.add_section(&bus.name, frames::cells_by_status(&bus.cells), format!("at the end; {} bus", bus.kind));
     if bus.outages.times > 0 {
         let end = if bus.outages.at_end { ", also at the end" } else { "" };
         let ticks = format!("{} ran without this bus", count_with_noun(bus.outages.ticks, "tick"));
@@ -462,7 +462,7 @@ fn add_cost_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) 
     let [gateway, cells, buses] = [gateway, cells, buses].map(|cores| cores.max(0.0) + 0.0);
     let cores = format!("{:.3}", gateway + cells + buses);
     if is_verbose {
-        rows.add_section("cost", "", "");
+        rows.add_section("resources used", "", "");
         let parts = format!("gateway {gateway:.3}, cells {cells:.3}, bus servers {buses:.3}");
         rows.add_row("processor, cores", cores, parts);
         if let Some(kib) = summary.memory.cell_private_kib {

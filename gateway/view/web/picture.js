@@ -66,7 +66,7 @@ void main() {
     if (shape == 4 && place.x > 0. && hex < .86) c = mark;
     if (shape == 5 && p.y < .16 && p.x < .66) c = mark;
     if (shape == 7 && r < .34) c = mark;
-    if (shape == 6 && max(p.x, p.y) < .34) c = mark;
+    if (shape == 6 && max(p.x, p.y) < .26) c = mix(c, mark, .5);
     if ((kind & 64) != 0 && hex > .52 && hex < .62) c = ink;
     if ((kind & 48) != 0 && hex > .72) c = (kind & 32) != 0 && hex < .84 ? mark : chosen;
   }

@@ -79,7 +79,10 @@ impl Bench<'_> {
             return;
         }
         for file in recording.into_iter().flat_map(|recording| &recording.files) {
-            eprint_line(&format!("{} frames received before the failure are in {}", file.frames, file.path));
+            eprint_line(&format!(
+                "{} frames received before the run ended are in {}",
+                file.frames, file.path
+            ));
         }
     }
 

@@ -136,7 +136,7 @@ pub enum Difference {
     },
     /// A cell without a node id is connected to this port.
     #[error(
-        "a cell without a node id is wired to {0}: the network assigns it a free node id, if there is one"
+        "a cell without a node id is wired to {0}: it takes part once the network has assigned it a free node id"
     )]
     Unnumbered(WireEnd),
     /// Cells whose parents form a circle, in order.

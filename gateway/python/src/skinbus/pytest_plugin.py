@@ -97,10 +97,12 @@ def _start(bench: Bench) -> None:
 
     try:
         bench.start()
+        return
     except ProgramMissing as error:
-        pytest.fail(str(error), pytrace=False)
+        text = str(error)
     except RunFailed as error:
-        pytest.fail("\n".join([str(error), *error.notes[-_NOTES:]]), pytrace=False)
+        text = "\n".join([str(error), *(note for note in error.notes[-_NOTES:] if note not in str(error))])
+    pytest.fail(text, pytrace=False)
 
 
 def _keep(recording: Path, state: _State) -> None:

@@ -154,7 +154,7 @@ fn verbose_has_all_rows() {
     for row in usual {
         assert!(verbose.contains(row) && !brief.contains(row), "{row}\n{brief}\n{verbose}");
     }
-    for row in ["single cells", "the whole skin", "tick lateness", "replies due", "recording", "vcan0"] {
+    for row in ["each cell", "the whole skin", "tick lateness", "replies due", "recording", "vcan0"] {
         assert!(verbose.contains(row) && brief.contains(row), "{row}\n{brief}\n{verbose}");
     }
     assert!(widest(&format_summary(&demo(), TableStyle { is_verbose: true, ..EIGHTY })) <= 80);

@@ -47,7 +47,9 @@ impl InputLine {
         let mut object = match serde_json::from_slice(line) {
             Ok(Value::Object(object)) => object,
             Ok(_) => return refused(None, not_an_object("it is another JSON value")),
-            Err(error) => return refused(None, not_an_object(&error.to_string())),
+            Err(error) => {
+                return refused(None, not_an_object(&format!("it is not JSON at column {}", error.column())));
+            }
         };
         let id = match object.remove("id").map(RequestId::try_from) {
             None => None,
@@ -188,7 +190,7 @@ mod tests {
         for (line, expected) in [
             (
                 "x",
-                "the line is not a command: expected value at line 1 column 1; send one JSON object a line, such as \
+                "the line is not a command: it is not JSON at column 1; send one JSON object a line, such as \
                    {\"do\":\"report\"}",
             ),
             (

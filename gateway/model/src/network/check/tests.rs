@@ -358,8 +358,8 @@ fn exchanged_cells_and_cells_without_a_node_id_are_named() {
         [
             "the cell with serial number 501 uses node id 2, but in the skin it is cell 1: swap the cells, or their \
              serial numbers in the skin",
-            "a cell without a node id is wired to port 2 of cell 2: the network assigns it a free node id, if there \
-             is one",
+            "a cell without a node id is wired to port 2 of cell 2: it takes part once the network has assigned \
+             it a free node id",
         ]
     );
 }
