@@ -209,7 +209,7 @@ where
 impl ReplayError {
     /// Exit code: 2 for wrong use or configuration, 1 for a replay that failed.
     #[must_use]
-    pub const fn exit_code(&self) -> u8 {
+    pub fn exit_code(&self) -> u8 {
         match self {
             Self::Run(error) => error.exit_code(),
             Self::Kinds(_)

@@ -1,7 +1,7 @@
 //! Survey of a capture from a first reading: the buses, the cells, the losses by the cells' own counters, and the state
 //! where the replayed part begins.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use model::tracker::{CellTracker, DEAD_AFTER, HeartbeatKind, MAX_LATE_EPOCHS};
 use protocol::can::Format;
@@ -26,7 +26,7 @@ const ABSENCE_TIMEOUT_NS: u64 = DEAD_AFTER.0 * 1_000;
 /// Maximum time in ns from the first joints after a cell's start to the cell's first heartbeat.
 const MAX_CELL_START_NS: u64 = 100_000_000;
 
-/// Time in ns after which a commit that was not answered counts as lost.
+/// Time in ns after which a heartbeat has the configuration of a commit whose answer is not in the capture.
 const COMMIT_TIMEOUT_NS: u64 = 3_000_000_000;
 
 /// Maximum number of joint broadcasts between the sending and the recording of a page of counters.
@@ -91,8 +91,8 @@ pub struct SurveyedBus {
     pub cells: BTreeMap<CellId, SurveyedCell>,
     /// State of cells according to messages from before the capture.
     before: BTreeMap<CellId, CellBeforeCapture>,
-    /// Cells that were told before the replayed part to commit and had not answered yet, with the time of the commit in
-    /// ns since 1970. The part begins with the new configuration, which their next heartbeats may lack.
+    /// Cells that were told to commit before the replayed part, and whose answer has not come, with the time of the commit
+    /// in ns since 1970. The part begins with the new configuration, which their next heartbeats may lack.
     committing: BTreeMap<CellId, u64>,
 }
 
@@ -131,8 +131,8 @@ struct MessageContext<'a> {
     /// Time in ns since 1970.
     nanos: u64,
     place: ReplayPartPosition,
-    /// True if the cell has not answered a commit from before the replayed part.
-    commits: bool,
+    /// True if the cell's answer to a commit from before the replayed part has not come.
+    is_committing: bool,
     /// Latest joint broadcasts, oldest first.
     joints: &'a VecDeque<JointsBroadcast>,
 }
@@ -271,7 +271,6 @@ impl Survey {
 impl SurveyedBus {
     /// Handles a message from before the capture that is latched at its start.
     fn add_latched_message(&mut self, message: &Message, nanos: u64) {
-        self.follow_commit(message, nanos, ReplayPartPosition::Before);
         if let Message::Network { from: Node::Cell(from), page: NetworkPage::Heartbeat(heartbeat), .. } =
             *message
         {
@@ -282,8 +281,13 @@ impl SurveyedBus {
             {
                 before.last_seen = nanos;
                 before.measures = is_settled && !heartbeat.state.has(Flags::TEST_MODE);
+                let commit_ns = self.committing.get(&from);
+                if commit_ns.is_some_and(|at| nanos > at.saturating_add(COMMIT_TIMEOUT_NS)) {
+                    self.committing.remove(&from);
+                }
+                let is_known = is_settled && !self.committing.contains_key(&from);
                 before.hash =
-                    if is_settled { InitialValue::Value(heartbeat.configuration) } else { InitialValue::No };
+                    if is_known { InitialValue::Value(heartbeat.configuration) } else { InitialValue::No };
             }
         } else if let Message::Configure { to, request: Request::Write { number, words }, .. } = *message {
             for (_, before) in self.before.iter_mut().filter(|(cell, _)| to.addresses_cell(**cell)) {
@@ -293,6 +297,7 @@ impl SurveyedBus {
                     before.hash = InitialValue::No;
                 }
             }
+            self.follow_commit(message, nanos, ReplayPartPosition::Before);
         }
     }
 
@@ -313,10 +318,10 @@ impl SurveyedBus {
         }
         self.is_accounted |= matches!(message, Message::Network { page: NetworkPage::Received(_), .. });
         self.sums += u64::from(matches!(message, Message::Sum { .. }));
-        let commits = from.is_some_and(|from| self.is_committing(from, nanos));
+        let is_committing = from.is_some_and(|from| self.committing.contains_key(&from));
         self.follow_commit(message, nanos, place);
         if let Some(cell) = from.and_then(|from| self.cells.get_mut(&from)) {
-            let context = MessageContext { nanos, place, commits, joints: &self.recent_joints };
+            let context = MessageContext { nanos, place, is_committing, joints: &self.recent_joints };
             cell.add_message(message, &context);
         } else if let Message::Joints { epoch, joints } = *message {
             self.joints += 1;
@@ -333,22 +338,30 @@ impl SurveyedBus {
     /// Follows commits of the cells' parameters, and their answers.
     fn follow_commit(&mut self, message: &Message, nanos: u64, place: ReplayPartPosition) {
         let commit = Parameter::Commit.number();
-        if let Message::Configure { to: Node::Cell(to), request: Request::Write { number, .. }, .. } =
-            *message
-            && (number, place) == (commit, ReplayPartPosition::Before)
+        if let Message::Configure { to, request: Request::Write { number, .. }, .. } = *message
+            && number == commit
         {
-            self.committing.insert(to, nanos);
+            let all = self.cells.keys().chain(self.before.keys()).copied();
+            let told: BTreeSet<_> = match to {
+                Node::Cell(cell) => BTreeSet::from([cell]),
+                Node::Gateway | Node::Everyone => all.filter(|cell| to.addresses_cell(*cell)).collect(),
+            };
+            for cell in told {
+                let is_committing = self.committing.remove(&cell).is_some();
+                let surveyed = self.cells.get_mut(&cell);
+                if place == ReplayPartPosition::Before {
+                    self.committing.insert(cell, nanos);
+                    surveyed.into_iter().for_each(SurveyedCell::forget_hash);
+                } else if is_committing {
+                    surveyed.into_iter().for_each(SurveyedCell::accept_unconfirmed_hash);
+                }
+            }
         } else if let Message::Configured { from, answer, .. } = *message
             && let Answer::Value { number, written: true, .. } | Answer::Refused { number, .. } = answer
             && number == commit
         {
             self.committing.remove(&from);
         }
-    }
-
-    /// Returns true if a cell has not answered a commit from before the replayed part.
-    fn is_committing(&self, cell: CellId, nanos: u64) -> bool {
-        self.committing.get(&cell).is_some_and(|at| nanos <= at.saturating_add(COMMIT_TIMEOUT_NS))
     }
 
     /// Returns the cells that send between two times, in ns since 1970.

@@ -15,6 +15,8 @@ use super::{
 pub struct SurveyedCell {
     /// Hash of the cell's configuration where the replayed part begins, if known.
     pub hash: InitialValue<u16>,
+    /// Hash in the last heartbeat before the cell's answer to a commit: of the former or of the new configuration.
+    unconfirmed_hash: Option<u16>,
     /// True if the cell measured in the replayed part, so that its torques cannot be reproduced.
     pub measured: bool,
     /// Times of the cell's first and last message in ns since 1970.
@@ -51,6 +53,7 @@ impl SurveyedCell {
         tracked.account = UplinkAccount::default();
         Self {
             hash: before.map_or(InitialValue::No, |before| before.hash),
+            unconfirmed_hash: None,
             measured: before.is_some_and(|before| before.measures),
             active: (first.map_or(nanos, |heard| heard.min(nanos)), nanos),
             silences: Vec::new(),
@@ -78,6 +81,7 @@ impl SurveyedCell {
 
     /// Ends the survey of the cell at the end of the capture, `nanos` in ns since 1970.
     pub(super) fn finish(&mut self, nanos: u64) {
+        self.accept_unconfirmed_hash();
         self.unrecorded = self.tracked.account.uplink().lost;
         if let Some(away) = self.away {
             self.silences.push((away, u64::MAX));
@@ -88,9 +92,21 @@ impl SurveyedCell {
         }
     }
 
+    /// Forgets the hash: the cell was told to commit before the replayed part.
+    pub(super) const fn forget_hash(&mut self) {
+        (self.hash, self.unconfirmed_hash) = (InitialValue::No, None);
+    }
+
+    /// Takes the hash in the last heartbeat, if the answer to the commit before it is not in the capture.
+    pub(super) fn accept_unconfirmed_hash(&mut self) {
+        if let (InitialValue::No, Some(hash)) = (self.hash, self.unconfirmed_hash.take()) {
+            self.hash = InitialValue::Value(hash);
+        }
+    }
+
     /// Handles a message that the cell sent.
     pub(super) fn add_message(&mut self, message: &Message, context: &MessageContext<'_>) {
-        let &MessageContext { nanos, place, commits, joints } = context;
+        let &MessageContext { nanos, place, is_committing, joints } = context;
         let word = self.tracked.record_packet(Micros(nanos / 1_000), message, None).word;
         if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = message {
             match word {
@@ -118,16 +134,16 @@ impl SurveyedCell {
         {
             // The cell was configured again before its first heartbeat, so its former configuration is unknown.
             self.hash = match self.hash {
-                _ if place == ReplayPartPosition::Before => InitialValue::No,
-                InitialValue::No if commits => InitialValue::No,
+                _ if place == ReplayPartPosition::Before || is_committing => InitialValue::No,
                 InitialValue::No => InitialValue::TooLate,
                 known @ (InitialValue::TooLate | InitialValue::Value(_)) => known,
             };
+            self.unconfirmed_hash = None;
         }
     }
 
     fn add_heartbeat(&mut self, heartbeat: &Heartbeat, context: &MessageContext<'_>) {
-        let &MessageContext { nanos, place, commits, .. } = context;
+        let &MessageContext { nanos, place, is_committing, .. } = context;
         // A cell that claims its node id answers nothing.
         if heartbeat.state.has(Flags::CLAIMING_NODE_ID) {
             self.claims.get_or_insert(nanos);
@@ -136,8 +152,9 @@ impl SurveyedCell {
         if let Some(since) = self.claims.take() {
             self.silences.push((since, nanos));
         }
-        let begins_later = place == ReplayPartPosition::In && commits;
-        if place == ReplayPartPosition::Before || self.hash == InitialValue::No && !begins_later {
+        if is_committing {
+            self.unconfirmed_hash = Some(heartbeat.configuration);
+        } else if place == ReplayPartPosition::Before || self.hash == InitialValue::No {
             self.hash = InitialValue::Value(heartbeat.configuration);
         }
         self.measured |= place == ReplayPartPosition::In && !heartbeat.state.has(Flags::TEST_MODE);

@@ -95,46 +95,73 @@ fn a_cell_may_have_taken_joints_before_its_first_heartbeat() {
     assert_eq!(bus.heard(30, 13), 4);
 }
 
-#[test]
-fn a_heartbeat_from_before_a_commit_is_answered_is_not_of_the_part_that_begins_with_it() {
-    let cell = CellId::new(1).unwrap();
-    let commit = Parameter::Commit.number();
-    let write = Message::Configure {
-        to: Node::Cell(cell),
-        tag: 1,
-        request: Request::Write { number: commit, words: [0; 6] },
-    };
+/// Surveys a bus on which cell 1 is told to commit, and returns its hash where the part from 1 µs on begins. Steps: `h`
+/// and `H`, a heartbeat with the former and the new configuration; `c` and `C`, a commit to the cell and to every cell;
+/// `a` and `r`, its answer, written and refused; `|`, the begin of the part. Latched messages are before a `~`.
+fn hash_after(steps: &str) -> InitialValue<u16> {
+    let (cell, commit) = (CellId::new(1).unwrap(), Parameter::Commit.number());
+    let to_commit =
+        |to| Message::Configure { to, tag: 1, request: Request::Write { number: commit, words: [0; 6] } };
     let answer = |answer| Message::Configured { from: cell, tag: 1, answer };
-    let (written, refused) = (
-        answer(Answer::Value { number: commit, written: true, words: [0; 6] }),
-        answer(Answer::Refused { number: commit, reason: Answer::REFUSED_WRONG_HASH }),
-    );
-    let heartbeat = |configuration, sent| {
-        NetworkPage::Heartbeat(Heartbeat { configuration, sent, ..Heartbeat::default() })
-    };
-    let hash = |answer: Option<&Message>, pause, heartbeats: [u16; 2]| {
-        // The part begins between the commit and its answer.
-        let mut bus = CountingBus(Survey::new(TimeRange { from: Some(1_000), to: None }), 0);
-        bus.take(&write);
-        bus.1 = pause;
-        bus.page(0, heartbeat(heartbeats[0], 10));
-        bus.1 += 1_000;
-        if let Some(answer) = answer {
-            bus.take(answer);
+    let (latched, steps) = steps.split_once('~').unwrap_or(("", steps));
+    let mut bus =
+        CountingBus(Survey::new(TimeRange { from: (!steps.starts_with('|')).then_some(1_000), to: None }), 0);
+    let mut sent = 10;
+    let mut message_of = |step| {
+        sent += u16::from("hHar".contains(step));
+        let heartbeat = |configuration| Message::Network {
+            from: Node::Cell(cell),
+            epoch: Epoch(0),
+            page: NetworkPage::Heartbeat(Heartbeat { configuration, sent: sent - 1, ..Heartbeat::default() }),
+        };
+        match step {
+            'h' => heartbeat(7),
+            'H' => heartbeat(9),
+            'c' => to_commit(Node::Cell(cell)),
+            'C' => to_commit(Node::Everyone),
+            'a' => answer(Answer::Value { number: commit, written: true, words: [0; 6] }),
+            _ => answer(Answer::Refused { number: commit, reason: Answer::REFUSED_WRONG_HASH }),
         }
-        bus.page(0, heartbeat(heartbeats[1], 11 + u16::from(answer.is_some())));
-        bus.0.buses[0].cells[&cell].hash
     };
-    assert_eq!(hash(Some(&written), 2_000, [7, 9]), InitialValue::Value(9));
-    assert_eq!(hash(Some(&refused), 2_000, [7, 7]), InitialValue::Value(7));
-    assert_eq!(hash(None, 2_000, [7, 7]), InitialValue::No, "the commit may still come");
-    assert_eq!(hash(None, COMMIT_TIMEOUT_NS + 1_000, [7, 7]), InitialValue::Value(7), "it was lost");
-    // A commit of the part itself: the part begins with the former configuration.
-    let mut bus = CountingBus(Survey::new(TimeRange::default()), 0);
-    bus.page(0, heartbeat(7, 10));
-    for message in [&write, &written] {
-        bus.take(message);
+    // Latched messages are 1 s apart.
+    let frames = latched.chars().zip(1..).map(|(step, at)| {
+        let frame = message_of(step).encode().frames(Format::Fd).next().unwrap();
+        LatchedFrame { bus: "vcan0".into(), own: true, frame, nanos: at * 1_000_000_000 }
+    });
+    let frames: Vec<_> = frames.collect();
+    bus.0.add_latched_frames(&frames);
+    bus.1 = 100_000_000_000;
+    for step in steps.chars() {
+        bus.1 += if step == '|' { 1_000 } else { 1 };
+        if step != '|' {
+            bus.take(&message_of(step));
+        }
     }
-    bus.page(0, heartbeat(9, 12));
-    assert_eq!(bus.0.buses[0].cells[&cell].hash, InitialValue::Value(7));
+    bus.0.finish();
+    bus.0.buses[0].cells[&cell].hash
+}
+
+#[test]
+fn a_part_that_begins_after_a_commit_begins_with_the_new_configuration() {
+    let (former, new) = (InitialValue::Value(7), InitialValue::Value(9));
+    for (steps, expected) in [
+        ("h|hcaH", former),
+        ("c|haH", new),
+        ("hch|haH", new),
+        ("hch|hrh", former),
+        ("hC|haH", new),
+        ("hca|H", new),
+        ("hcaH|H", new),
+        // The answer is not in the capture.
+        ("hc|hhH", new),
+        ("hc|hhhcaH", former),
+        // It came before the capture, or its commit did.
+        ("hc~|HH", new),
+        ("hch~|haH", new),
+        ("hchhhhH~|H", new),
+        // It is not known.
+        ("hc|acaH", InitialValue::TooLate),
+    ] {
+        assert_eq!(hash_after(steps), expected, "{steps}");
+    }
 }
