@@ -7,7 +7,9 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use protocol::usage::{Failure, eprint_line, eprint_lines, ignore_broken_pipe, print_raw, print_text};
-use trace::files::{AtomicFile, STANDARD_OUTPUT, check_writable, parent_folder, with_creation_hint};
+use trace::files::{
+    AtomicFile, STANDARD_OUTPUT, check_writable, is_disk_full, parent_folder, with_creation_hint,
+};
 
 /// The option that allows existing files to be overwritten.
 #[derive(Args, Clone, Copy, Debug)]
@@ -84,15 +86,10 @@ pub(crate) fn write_and_finish(
     written.map_err(|error: io::Error| Failure::run_error(format!("{name}: {}", with_creation_hint(error))))
 }
 
-/// Returns the error for a file that cannot be written, which counts as wrong use.
+/// Returns the error for a file that cannot be written, which counts as wrong use unless the disk is full.
 pub(crate) fn write_refused_failure(option: &str, path: &Path, error: &io::Error) -> Failure {
     let text = format!("{}: {error}", option_and_path(option, path));
-    // A full disk is no wrong use.
-    if error.kind() == io::ErrorKind::StorageFull {
-        Failure::run_error(text)
-    } else {
-        Failure::usage_error(text)
-    }
+    if is_disk_full(error) { Failure::run_error(text) } else { Failure::usage_error(text) }
 }
 
 fn option_and_path(option: &str, path: &Path) -> String {

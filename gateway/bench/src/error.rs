@@ -10,6 +10,7 @@ use protocol::document::DocumentError;
 use protocol::skin::Skin;
 use protocol::time::Span;
 use thiserror::Error;
+use trace::files::is_disk_full;
 
 use crate::bus::served::ServeError;
 use crate::bus::time::BusTimeError;
@@ -175,9 +176,14 @@ impl RunError {
 
     /// Exit code: 2 for wrong use or configuration, 1 for a run that failed.
     #[must_use]
-    pub const fn exit_code(&self) -> u8 {
+    pub fn exit_code(&self) -> u8 {
         match self {
             Self::Emulate(error) => error.exit_code(),
+            Self::Output(OutputError::Candump { source, .. } | OutputError::Mcap { source, .. })
+                if is_disk_full(source) =>
+            {
+                1
+            }
             Self::Document(_)
             | Self::Bus(_)
             | Self::Launch(_)

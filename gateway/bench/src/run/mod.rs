@@ -79,7 +79,7 @@ pub struct RunOptions {
     pub announced: Vec<String>,
 }
 
-/// Runs a bench to its end, or until SIGINT or SIGTERM. A failed run returns a summary too, with the reason. Each of
+/// Runs a bench to its end, or until SIGINT, SIGTERM or SIGHUP. A failed run returns a summary too, with the reason. Each of
 /// `remotes` controls the bench while the loop runs.
 ///
 /// # Errors

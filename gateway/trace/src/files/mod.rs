@@ -15,8 +15,8 @@ pub use log::LogFile;
 pub use protocol::input::parent_folder;
 use target::{OutputTarget, open_stream, with_exists_hint};
 pub use target::{
-    STANDARD_OUTPUT, check_writable, check_writable_regular_file, path_with_suffix, rename, sync_folder,
-    with_creation_hint,
+    STANDARD_OUTPUT, check_writable, check_writable_regular_file, is_disk_full, path_with_suffix, rename,
+    sync_folder, with_creation_hint,
 };
 pub(crate) use target::{
     create_unnamed_file, device_and_inode, exists_error, lock_exclusively, name_unnamed_file, open_no_follow,

@@ -280,10 +280,16 @@ pub fn sync_folder(path: &Path) {
     let _ = File::open(parent_folder(path)).and_then(|folder| folder.sync_all());
 }
 
+/// Returns true for errors that report a full disk or an exceeded quota.
+#[must_use]
+pub fn is_disk_full(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)
+}
+
 /// Adds advice to an error of creating a file, if the folder or the disk causes it.
 #[must_use]
 pub fn with_creation_hint(error: io::Error) -> io::Error {
-    if matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded) {
+    if is_disk_full(&error) {
         return io::Error::new(
             error.kind(),
             format!("{error}; free some space, or name a file on another disk"),

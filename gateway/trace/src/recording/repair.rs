@@ -9,7 +9,7 @@ use rustix::fs::{Gid, fchown};
 
 use super::names::{self, PartFile};
 use super::recover::{RecoverError, RecoveryResult, recover};
-use super::sink::is_disk_full;
+use crate::files::is_disk_full;
 use crate::files::{AtomicFile, create_unnamed_file, parent_folder};
 
 /// The maximum number of names to try for a new file if other programs create files of the same names.

@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use rustix::fs::{FallocateFlags, fallocate};
 
-use crate::files::{create_unnamed_file, write_with_retries};
+use crate::files::{create_unnamed_file, is_disk_full, write_with_retries};
 
 /// The space in bytes that is reserved for the end of a file without chunks; half of it is for one pending chunk.
 const RESERVE_BYTES: u64 = 512 << 10;
@@ -101,12 +101,6 @@ fn reserve(folder: &Path) -> Option<ReservedSpace> {
     let file = create_unnamed_file(folder, 0o600).ok()?;
     fallocate(&file, FallocateFlags::empty(), 0, RESERVE_BYTES).ok()?;
     Some(ReservedSpace { file, bytes: RESERVE_BYTES })
-}
-
-/// Returns true for errors that report a full disk or an exceeded quota.
-#[must_use]
-pub fn is_disk_full(error: &io::Error) -> bool {
-    matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)
 }
 
 impl Write for ReservedFile {
