@@ -16,7 +16,7 @@ pub(crate) const RESET_COLOUR: &str = "\x1b[0m";
 
 /// Indent of a name that is kept when the name takes two lines.
 const NAME_INDENT: &str = "\u{a0}";
-/// Bounds of the width of a table in columns. A terminal may report 0 columns, which says nothing.
+/// Bounds of the width of a table in columns.
 const MIN_TABLE_WIDTH: u16 = 40;
 const MAX_TABLE_WIDTH: u16 = 110;
 /// Maximum width of a row's name in one line.
@@ -99,7 +99,7 @@ pub(crate) fn format_quantiles(quantiles: &Quantiles) -> String {
     format!("{p50:.0} / {p90:.0} / {p99:.0} / {max:.0}")
 }
 
-/// Table with a border and right-aligned numeric columns. Texts in rows are [`shown`]; a header may have several lines.
+/// Table with a border and right-aligned numeric columns, as wide as the terminal at most. Texts in rows are [`shown`]; a header may have several lines.
 pub(crate) fn table<H: Into<String>>(
     head: impl IntoIterator<Item = H>,
     rows: impl IntoIterator<Item = Vec<String>>,
@@ -107,6 +107,10 @@ pub(crate) fn table<H: Into<String>>(
 ) -> Table {
     let mut table = Table::new();
     table.load_style(presets::UTF8_BORDERS_ONLY).set_content_arrangement(ContentArrangement::Dynamic);
+    match readable_width(table.width()) {
+        Some(columns) => table.set_width(columns),
+        None => table.force_no_tty(),
+    };
     table.set_header(head.into_iter().map(|head| printable_lines(&head.into()).into_owned()));
     table.add_rows(
         rows.into_iter().map(|row| row.iter().map(|text| printable(text).into_owned()).collect::<Vec<_>>()),
@@ -119,6 +123,11 @@ pub(crate) fn table<H: Into<String>>(
     table
 }
 
+/// Returns the width of a terminal in which tables can be read; `None` if it is unknown, as of a terminal of 0 columns.
+pub(crate) fn readable_width(terminal: Option<u16>) -> Option<u16> {
+    terminal.filter(|columns| *columns > 0).map(|columns| columns.max(MIN_TABLE_WIDTH))
+}
+
 /// Limits a table to the width of the terminal, and to a readable width.
 pub(crate) fn limit_width(table: Table) -> Table {
     limit_width_to(table, MAX_TABLE_WIDTH)
@@ -126,8 +135,8 @@ pub(crate) fn limit_width(table: Table) -> Table {
 
 /// Limits a table to the width of the terminal, and to `max` columns.
 pub(crate) fn limit_width_to(mut table: Table, max: u16) -> Table {
-    let terminal = table.width().filter(|width| *width > 0);
-    table.set_width(terminal.map_or(max, |width| width.clamp(MIN_TABLE_WIDTH, max)));
+    let width = table.width().map_or(max, |width| width.min(max));
+    table.set_width(width);
     table
 }
 
@@ -310,12 +319,8 @@ mod tests {
 
     #[test]
     fn a_terminal_without_columns_says_nothing_about_the_width() {
-        let limited = |terminal| {
-            let mut table = Table::new();
-            table.set_width(terminal);
-            limit_width_to(table, 80).width()
-        };
-        assert_eq!([0, 7, 60, 200].map(limited), [80, 40, 60, 80].map(Some));
+        let widths = [None, Some(0), Some(7), Some(60)].map(readable_width);
+        assert_eq!(widths, [None, None, Some(40), Some(60)]);
     }
 
     #[test]

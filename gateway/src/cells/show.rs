@@ -14,7 +14,7 @@ use protocol::time::Micros;
 use rustix::termios::tcgetwinsize;
 use serde::Serialize;
 
-use crate::print::{abbreviate_names, drop_empty_columns, space_separated};
+use crate::print::{abbreviate_names, drop_empty_columns, readable_width, space_separated};
 
 /// A bus as a skin describes it, for comparison with the cells found.
 pub(super) struct DescribedBus {
@@ -101,8 +101,8 @@ impl<'a> CellList<'a> {
     /// too narrow.
     pub(super) fn table(&self) -> String {
         let whole = self.lines(COLUMNS.into_iter().chain(COUNTER_COLUMNS));
-        let text = match Table::new().width() {
-            Some(wide) if wide > 0 && width(&whole) > usize::from(wide) => self.lines(COLUMNS),
+        let text = match readable_width(Table::new().width()) {
+            Some(wide) if width(&whole) > usize::from(wide) => self.lines(COLUMNS),
             _ => whole,
         };
         text + &self.format_totals()

@@ -124,8 +124,9 @@ fn format_one_line_per_cell(cells: &[CellExplanation], is_finest: bool) -> Strin
     let joints = |cell: &CellExplanation| cell.rows.iter().map(|row| row.joint).collect::<Vec<_>>();
     let tables = cells.chunk_by(|one, other| joints(one) == joints(other)).map(format_torques);
     format!(
-        "\ntorque of each cell about each joint{unit}; 'steps': largest difference from the recomputed torque, in steps of {steps}. Use --cell to see a cell's whole computation\n{}",
-        tables.collect::<String>()
+        "\ntorque of each cell about each joint{unit}; 'steps': largest difference from the recomputed torque, in steps of {steps}. Use --cell to see a cell's whole computation\n{}{}",
+        tables.collect::<String>(),
+        verdict_legend(cells)
     )
 }
 
@@ -209,8 +210,8 @@ fn verdict_info(verdict: &WordVerdict) -> (u8, &'static str, Option<String>) {
     match verdict {
         WordVerdict::Nearest => (0, "nearest", Some("the word is the step nearest to J F_z".to_owned())),
         WordVerdict::Rounded { .. } => {
-            let means =
-                "a Jacobian J that is this many steps of 2^-14 m off, by 16-bit rounding, gives this word";
+            let means = "a Jacobian J that is off by 16-bit rounding gives the word; J with a number: by these \
+                         steps of 2^-14 m";
             (1, "16 bits", Some(means.to_owned()))
         }
         WordVerdict::Saturated => {
@@ -316,9 +317,9 @@ fn format_joint_rows(cells: &[CellExplanation], by_cell: bool) -> String {
     let names = CellNames::for_cells(cells);
     let first = if by_cell { names.column_heading() } else { "joint".to_owned() };
     let mut head = vec![first];
-    head.extend(by_cell.then(|| "F_z N".to_owned()));
+    head.extend(by_cell.then(|| "F_z,\nN".to_owned()));
     head.extend(
-        ["lever\nJ, m", "J F_z,\nNm", "nearest\nword", "word\nsent", "sent,\nNm", "steps\noff", "verdict"]
+        ["J", "J F_z,\nNm", "nearest\nword", "word\nsent", "sent,\nNm", "steps\noff", "verdict"]
             .map(str::to_owned),
     );
     let line = |cell: &CellExplanation, row: &TorqueRow| {
