@@ -14,8 +14,8 @@ const RATE = Math.log(1.19), STIFF = 7;
 const EASY = [0.8, 0.88], STEER_RATE = 2, STEERED = [0.15, 1.35], TRIED = 0.03;
 // Beyond these it turns as far as it takes, in four steps, the longest of them at this speed in rad/s.
 const HELD = [0.74, 0.95], RESCUE_RATE = 5;
-// If the robot still does not fit, by more than this share, the view changes to the nearest of directions this far away, in
-// rad, that help.
+// If the robot still does not fit, by more than this share, the view changes to the best of the directions that are this far
+// away in rad: nearer ones first.
 const STUCK = 0.02, FAR = [0.3, 0.6, 1, 1.5];
 // A view that a user turns follows faster.
 const TURNED_RATE = Math.log(4), TURNED_MS = 500;
@@ -79,6 +79,9 @@ export class Camera {
   // next; `now` is in ms. However late a frame is, the way to it is followed in short steps.
   follow(points, soon, seconds, now, width, height, jumps = false) {
     if (!points.length || !width || !height) return;
+    // The robot is fitted into a picture of another size at once.
+    if (this.seen && (this.seen[0] !== width || this.seen[1] !== height)) jumps = true;
+    this.seen = [width, height];
     const from = jumps || this.last?.length !== points.length ? points : this.last;
     this.last = points;
     const steps = Math.max(1, Math.ceil(seconds / STEP_S - 1e-6)), step = seconds / steps;
@@ -126,7 +129,7 @@ export class Camera {
     this.pitch = clamp(this.pitch + this.steering[1] * seconds, ...STEERED);
   }
 
-  // Turns at once, by as little as helps, if the robot would not fit even with the fastest zoom.
+  // Turns at once, if the robot would not fit even with the fastest zoom: by little if that helps, else to another side.
   rescue(points, seconds, width, height) {
     const off = (yaw, pitch) => {
       const fill = this.fitted(points, width, height, 1, this.basis(yaw, pitch)).distance / this.distance;

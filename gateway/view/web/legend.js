@@ -47,7 +47,7 @@ export function shapeKey(css, mark) {
   if (mark === "disc") { pen.beginPath(); pen.arc(0, 0, r * 0.34, 0, 7); pen.fill(); }
   if (mark === "half") { pen.fillRect(0, -r * 0.7, r * 0.6, r * 1.4); }
   if (mark === "bar") { pen.fillRect(-r * 0.66, -r * 0.16, r * 1.32, r * 0.32); }
-  if (mark === "square") { pen.fillRect(-r * 0.34, -r * 0.34, r * 0.68, r * 0.68); }
+  if (mark === "square") { pen.globalAlpha = 0.5; pen.fillRect(-r * 0.26, -r * 0.26, r * 0.52, r * 0.52); pen.globalAlpha = 1; }
   if (mark === "root") { pen.lineWidth = 4; hexagon(0.57); pen.stroke(); }
   return canvas;
 }

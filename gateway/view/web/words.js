@@ -106,7 +106,7 @@ function where(scene, { bus, node }, joints) {
   if (!cell) return [];
   const three = (values, digits) => values.map((v) => v.toFixed(digits).replace("-", "−")).join(", ");
   return [
-    ["On the link after", `${joints[cell.joint - 1]?.name ?? "the base"}, DH row ${cell.row}`],
+    ["Link", `moved by ${joints[cell.joint - 1]?.name ?? cell.joint}, DH row ${cell.row}`],
     ["Position, mm", three(cell.position.map((v) => v * 1000), 1)],
     ["Normal", three(cell.normal, 3)],
   ];
