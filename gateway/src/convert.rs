@@ -441,8 +441,7 @@ fn progress_bar(size: Option<u64>) -> ProgressBar {
 /// Returns the notes on a conversion, one per line.
 fn remarks(reader: &Reader, done: &ConversionCounts, style: &LogStyle, text: bool) -> Vec<String> {
     let mut lines = reader.remarks();
-    let how =
-        if style.plain { "" } else { ", which some tools cannot read; --direction adds the directions" };
+    let how = if style.plain { "" } else { ", because some tools cannot read it; --direction writes it" };
     let LossCounts { digits, direction, raw_dlc, name } = done.shortened;
     let written = ["frame was written", "frames were written"];
     for (count, [one, more], what) in [
@@ -459,7 +458,7 @@ fn remarks(reader: &Reader, done: &ConversionCounts, style: &LogStyle, text: boo
         (done.can_xl, ["is a CAN XL frame", "are CAN XL frames"], ": not read"),
         (done.dropped, ["frame is missing", "frames are missing"], ": lost by the recorder"),
         (digits, written, " without the digits of the time below 1 us"),
-        (direction, written, &format!(" without a direction, T or R{how}")),
+        (direction, written, &format!(" without their direction (T or R){how}")),
         (raw_dlc, written, " without their raw DLC"),
         (
             name,

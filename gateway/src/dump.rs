@@ -68,8 +68,8 @@ pub(crate) struct DumpCommand {
     /// is the mask of the bits to compare
     #[arg(long, value_name = "ID[:MASK]", value_delimiter = ',')]
     id: Vec<IdMask>,
-    /// Show only frames that belong to touches: nonzero torques and sums, stimuli and sensor pages with a force or a
-    /// proximity, heartbeats of active cells
+    /// Show only frames that belong to touches: torques and sums that are not zero, stimuli and reported sensor values
+    /// with a force or a proximity, heartbeats of cells in contact
     #[arg(long)]
     contact: bool,
     /// Show frames from this time on: seconds since the start of the run, or since the first frame of a log
@@ -191,11 +191,11 @@ impl DumpCommand {
             ("live", None, show_live(&mut receive_ends, &mut show, self.to, &stopped))
         };
         ignore_broken_pipe(show.finish().and_then(|()| show.flush()))?;
-        if let (Ok(()), Some(absent)) = (&done, show.absent_names()) {
+        if let (Ok(End::OfInput), Some(absent)) = (&done, show.absent_text()) {
             output::print_note(if is_capture {
-                format!("{title} contains no frame of {absent}")
+                format!("{title} contains no frame {absent}")
             } else {
-                format!("no frame of {absent} came")
+                format!("no frame {absent} came")
             });
         }
         let report = show.report();
@@ -207,7 +207,7 @@ impl DumpCommand {
                 false => table::report_text(&title, what, &report, extras.as_ref()),
             })?;
         }
-        done
+        done.map(|_| ())
     }
 
     /// Refuses a skin, whose buses may have been meant.
@@ -221,7 +221,7 @@ impl DumpCommand {
         let (file, buses) =
             (file.display(), skin.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>());
         Err(Failure::usage_error(format!(
-            "{file} is a skin, which contains no frames; its buses are followed by `skinbus dump {} --skin {file}`",
+            "{file} is a skin, which contains no frames; to follow its buses, run `skinbus dump {} --skin {file}`",
             buses.join(" ")
         )))
     }
@@ -267,8 +267,25 @@ fn statistics_json(
     to_pretty_json(&whole)
 }
 
+/// Reason why a dump ended without an error.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+enum End {
+    /// The capture was read whole; or a live dump ended as requested.
+    OfInput,
+    /// The reader of the output has closed it; or the reading of a capture was interrupted.
+    Early,
+}
+
+impl End {
+    /// Returns how a dump ended whose output may have been closed.
+    fn of_output(done: io::Result<()>) -> Result<Self, Failure> {
+        let end = if done.is_ok() { Self::OfInput } else { Self::Early };
+        ignore_broken_pipe(done).map(|()| end)
+    }
+}
+
 /// Shows the frames of a capture.
-fn show_capture(reader: &mut Reader, show: &mut FrameOutput<impl Write>) -> Result<(), Failure> {
+fn show_capture(reader: &mut Reader, show: &mut FrameOutput<impl Write>) -> Result<End, Failure> {
     let name = reader.name().to_owned();
     let (mut frames, mut missing) = (0_u64, LossCounts::default());
     let done = loop {
@@ -304,17 +321,18 @@ fn show_capture(reader: &mut Reader, show: &mut FrameOutput<impl Write>) -> Resu
             }
         }
     };
-    ignore_broken_pipe(done)?;
+    let end = End::of_output(done)?;
     if !reader.has_times() {
         show.disable_rates();
     }
     // Missing frames have been reported at their places, so they are not reported again at the end.
     missing.frames = 0;
     missing.print_counts(reader, "not shown");
-    if frames == 0 && !stop::stop_flag().load(Ordering::Relaxed) {
+    let is_interrupted = stop::stop_flag().load(Ordering::Relaxed);
+    if frames == 0 && !is_interrupted {
         return Err(no_frame_failure(reader));
     }
-    Ok(())
+    Ok(if is_interrupted { End::Early } else { end })
 }
 
 /// Interval between checks whether frames that wait for the rest of their packet have timed out.
@@ -326,25 +344,25 @@ fn show_live(
     show: &mut FrameOutput<impl Write>,
     to: Option<u64>,
     stopped: &AtomicBool,
-) -> Result<(), Failure> {
+) -> Result<End, Failure> {
     // A bus on which nothing is sent ends too.
     let time_limit = |from: Instant| to.map(|to| from + Duration::from_nanos(to));
     let (mut end, mut has_begun) = (time_limit(Instant::now()), false);
     let done = loop {
         if stopped.load(Ordering::Relaxed) || end.is_some_and(|end| Instant::now() >= end) {
-            break Ok(());
+            break Ok(End::OfInput);
         }
         match show_received(receive_ends, show) {
             // Report the frames that were lost until then before returning the error.
             Err(failure) => break Err(failure),
             // If the reader of the output has read enough, end the dump without an error.
-            Ok(Err(error)) => break ignore_broken_pipe(Err(error)),
+            Ok(Err(error)) => break End::of_output(Err(error)),
             // Times count from the first frame.
             Ok(Ok(true)) if !has_begun => (end, has_begun) = (time_limit(Instant::now()), true),
             Ok(Ok(_)) => {}
         }
         if show.is_limit_reached() {
-            break Ok(());
+            break Ok(End::OfInput);
         }
     };
     for receive_end in receive_ends {

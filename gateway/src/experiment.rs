@@ -45,7 +45,7 @@ use folder::ResultFolder;
   skinbus experiment fig9 fig10 -o laws
   skinbus experiment all -o experiments")]
 pub(crate) struct ExperimentCommand {
-    /// Names of experiments; all runs every experiment, and list describes them
+    /// Names of experiments; `all` runs each of them, `list` describes them
     #[arg(value_name = "NAME", required = true)]
     names: Vec<ExperimentArgument>,
     /// Directory for the results, which is created if necessary

@@ -59,7 +59,7 @@ pub(crate) struct FitCommand {
     /// Assume this frame format on all buses, instead of the skin's formats
     #[arg(help_heading = FOR_SKIN, long, value_parser = one_of_values(FORMATS))]
     format: Option<Format>,
-    /// Longest time in µs that a cell needs to compute its answer [the paper's cell: 68.5]
+    /// Longest time in µs that a cell needs to compute its answer [default: 68.5, as the paper's cell]
     #[arg(help_heading = FOR_SKIN, long, value_name = "US", value_parser = parse_computation_ns)]
     computation: Option<u64>,
     /// Assumed bit rates of a bus, such as can0=500k/2M or can1=1M; repeat the option for further buses
@@ -89,8 +89,8 @@ pub(crate) struct FitCommand {
     ///
     /// Keys of a frame: bus; id, as candump prints it; time, its time stamp; start_s and end_s, its computed start and
     /// end (all in s, on the clock of the capture); nominal_bits and data_bits, including stuff bits and intermission;
-    /// time_is, which is "end" if the time stamp is the end of the frame, and absent otherwise. Frames that are not
-    /// counted have null for bits, start_s and end_s; frames that could not be sent, for start_s and end_s.
+    /// time_is, which is "end" if the time stamp is the end of the frame, and absent otherwise. Of frames that
+    /// are not counted, bits, start_s and end_s are null; of those that could not be sent, start_s and end_s.
     #[arg(long, short)]
     json: bool,
     #[command(flatten)]

@@ -178,8 +178,8 @@ pub(crate) struct DemoCommand {
 /// duration, and prints a table of results. Ctrl-C ends the run early, with the table. The sockets of embedded buses
 /// are in SKINBUS_DIR, if that is set: give benches that run side by side a directory each. Exit code 0: the run came
 /// to its end; 1: it ended early, a bus was lost at its end, or its recording is incomplete; 2: wrong use or
-/// configuration; 3: the robot was halted at the end; 4: the external controller was absent, but had not halted it; 5: a process of cells
-/// failed.
+/// configuration; 3: the robot was halted at the end; 4: the external controller was absent at the end, and the robot
+/// was not halted; 5: a process of cells failed.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus run gateway/examples/ur5-253.toml --scenario gateway/examples/demo.toml

@@ -86,8 +86,8 @@ pub(crate) struct ViewCommand {
     /// If a bus does not exist yet, wait for it instead of failing
     #[arg(long)]
     wait: bool,
-    /// Also serve the topics of a recording, live or as the page plays it, to Foxglove and Lichtblick: on this port of
-    /// this machine, by Foxglove's WebSocket protocol; port 0 stands for any free port
+    /// Also send to Foxglove and Lichtblick the topics of a recording: those of a live bus as its frames come, or those
+    /// of a file as the page plays it. By Foxglove's WebSocket protocol on this port of this machine; 0: any free port
     #[arg(long, value_name = "PORT")]
     foxglove: Option<u16>,
     /// Serve the run that started this program: accept connections on the listener at standard input, exchange commands

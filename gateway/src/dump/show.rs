@@ -168,12 +168,15 @@ impl<W: Write> FrameOutput<W> {
         Ok(())
     }
 
-    /// Returns the names of the buses and nodes that the options name but of which no frame came.
-    pub(super) fn absent_names(&self) -> Option<String> {
+    /// Returns which buses and nodes the options name although no frame came of them, such as `of vcan3`.
+    pub(super) fn absent_text(&self) -> Option<String> {
         let is_on_absent = |it: &&NodeSelector| it.bus.as_ref().is_some_and(|bus| self.absent.contains(bus));
-        let nodes = self.absent_nodes.iter().filter(|it| !is_on_absent(it)).map(|it| format!("node {it}"));
-        let names: Vec<_> = self.absent.iter().cloned().chain(nodes).collect();
-        (!names.is_empty() && self.remaining > 0).then(|| comma_separated(&names))
+        let nodes: Vec<_> =
+            self.absent_nodes.iter().filter(|it| !is_on_absent(it)).map(ToString::to_string).collect();
+        let buses = (!self.absent.is_empty()).then(|| format!("of {}", comma_separated(&self.absent)));
+        let nodes = (!nodes.is_empty()).then(|| format!("from or to {}", comma_separated(&nodes)));
+        let texts: Vec<_> = buses.into_iter().chain(nodes).collect();
+        (!texts.is_empty() && self.remaining > 0).then(|| texts.join(", or "))
     }
 
     /// Returns true if no further frames are to be shown.

@@ -268,7 +268,7 @@ fn dump_shows_a_foreign_log_as_foreign_in_its_order() {
     let Output { status, stdout, stderr } =
         nodes.args(["dump", "car.log", "--cell", "gateway,12"]).current_dir(folder).output().unwrap();
     assert_eq!((status.code(), stdout.as_slice()), (Some(0), &b""[..]));
-    assert_eq!(stderr, b"car.log contains no frame of node gateway, node 12\n");
+    assert_eq!(stderr, b"car.log contains no frame from or to gateway, 12\n");
     let json = gateway(folder, "dump car.log --json");
     for line in json.lines() {
         let line: Value = serde_json::from_str(line).unwrap();

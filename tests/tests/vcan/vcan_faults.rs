@@ -196,7 +196,7 @@ fn an_interface_that_is_removed_ends_the_run_with_one_line_and_the_log_is_kept()
     let log = Log::read(&place.read("run.log"), Format::Fd);
     assert!(!log.torques().is_empty());
     assert!(
-        stderr.contains(&format!("{} frames received before the failure are in run.log", log.frames.len())),
+        stderr.contains(&format!("{} frames received before the run ended are in run.log", log.frames.len())),
         "{stderr}"
     );
 

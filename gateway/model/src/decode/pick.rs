@@ -100,11 +100,7 @@ impl fmt::Display for NodeSelector {
         if let Some(bus) = &self.bus {
             write!(f, "{bus}:")?;
         }
-        match self.node {
-            Node::Gateway => f.write_str("gateway"),
-            Node::Everyone => f.write_str("everyone"),
-            Node::Cell(cell) => write!(f, "{cell}"),
-        }
+        write!(f, "{}", self.node)
     }
 }
 

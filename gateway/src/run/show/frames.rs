@@ -57,7 +57,7 @@ pub(super) fn add_timed_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verb
     rows.add_row(
         "  time of a frame, µs",
         format_quantiles(&timed.wait_us),
-        "from the request to send it to its end",
+        "from its send request to its end",
     );
     if is_verbose || timed.behind > 0 {
         let behind = format!(

@@ -374,7 +374,7 @@ fn what_the_options_of_a_dump_leave_out_is_said() {
     output(gateway(&format!("skin generate --cells 6 --buses 2 -o {skin}")));
     let Output { status, stderr, .. } = gateway(&format!("dump {skin}")).output().unwrap();
     let expected = format!(
-        "skinbus: {skin} is a skin, which contains no frames; its buses are followed by `skinbus dump vcan0 vcan1 --skin {skin}`\n"
+        "skinbus: {skin} is a skin, which contains no frames; to follow its buses, run `skinbus dump vcan0 vcan1 --skin {skin}`\n"
     );
     assert_eq!((status.code(), text(&stderr)), (Some(2), expected.as_str()));
     let log = bench.parent.path().join("run.log");
@@ -383,7 +383,7 @@ fn what_the_options_of_a_dump_leave_out_is_said() {
     for (arguments, expected) in [
         ("--bus vcan3", "contains no frame of vcan3"),
         ("--cell vcan3:1", "contains no frame of vcan3"),
-        ("--cell vcan0:99,98", "contains no frame of node vcan0:99, node 98"),
+        ("--cell vcan0:99,98", "contains no frame from or to vcan0:99, 98"),
     ] {
         let Output { status, stdout, stderr } = gateway(&format!("dump {log} {arguments}")).output().unwrap();
         let expected = format!("{log} {expected}\n");

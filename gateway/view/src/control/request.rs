@@ -48,7 +48,11 @@ impl InputLine {
             Ok(Value::Object(object)) => object,
             Ok(_) => return refused(None, not_an_object("it is another JSON value")),
             Err(error) => {
-                return refused(None, not_an_object(&format!("it is not JSON at column {}", error.column())));
+                let reason = match error.to_string() {
+                    text if text.starts_with("number out of range") => text,
+                    _ => format!("it is not JSON at column {}", error.column()),
+                };
+                return refused(None, not_an_object(&reason));
             }
         };
         let id = match object.remove("id").map(RequestId::try_from) {

@@ -143,7 +143,7 @@ pub struct CellDetail {
     pub configuration: [Option<String>; 2],
     /// The gains and thresholds of the cell, from the skin.
     pub gains: GainsAndThresholds,
-    /// The fields of its sensors pages, without pages that nobody has sent.
+    /// The fields of its sensors pages whose values are known.
     pub readings: Vec<SensorReading>,
     /// Its force by Algorithm 1, in N; null if its sensor values are unknown.
     pub force_n: Option<f64>,

@@ -54,7 +54,7 @@ pub enum DirectoryError {
         us: u32,
     },
     /// Other users have access to the directory.
-    #[error("the directory {} with the sockets of embedded buses has mode {mode:04o}, so other users can open it: run `chmod 700` on it, or set SKINBUS_DIR to another directory", path.display())]
+    #[error("the directory {} for embedded buses has mode {mode:04o}, so other users can open it: run `chmod 700` on it, or set SKINBUS_DIR to another directory", path.display())]
     Mode {
         /// The directory.
         path: PathBuf,

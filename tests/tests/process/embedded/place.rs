@@ -85,7 +85,7 @@ fn a_directory_that_others_can_enter_is_refused_by_both_sides() {
     std::fs::create_dir(&directory).unwrap();
     std::fs::set_permissions(&directory, std::fs::Permissions::from_mode(0o755)).unwrap();
     let expected = format!(
-        "the directory {} with the sockets of embedded buses has mode 0755, so other users can open it: run `chmod 700` on \
+        "the directory {} for embedded buses has mode 0755, so other users can open it: run `chmod 700` on \
          it, or set SKINBUS_DIR to another directory",
         directory.display()
     );
