@@ -72,7 +72,7 @@ export function say(scene, said, ask, health, hardest) {
   facts([
     ["Cells", String(scene.cells.length)],
     ["In contact", String(said.contacts)],
-    ...(hardest ? [["Hardest", hardest]] : []),
+    ...(hardest ? [["Pressed hardest", hardest]] : []),
     ["Silent", String(said.dead), said.dead ? "bad" : ""],
     ["Epochs complete", ...(due ? noted(health, said.buses.map((_, b) => `${b} incomplete`), `${complete} of ${due}`) : ["–"])],
   ]);
