@@ -292,9 +292,14 @@ fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
     place.write("gone.log", &without(&gone, is_left_out));
     let (ended, replayed) = place.replayed("gone.log", &format!("{FRESH} --speed max"));
     let [_, different, missing, extra] = replayed.replies();
-    // Without counters a reply that a busy machine kept out of the recording is extra, too.
-    assert!(ended.code() == Some(1) && (different, missing) == (0, 0) && extra >= 1, "{:#}", replayed.0);
-    assert_eq!(replayed.text("/expect/first/how"), "extra");
+    // Without counters a reply that a busy machine kept out of the recording is extra, too. Pages that a cell sent with a
+    // heartbeat that is left out here are missing.
+    assert!(ended.code() == Some(1) && different == 0 && extra >= 1, "{:#}", replayed.0);
+    if missing == 0 {
+        assert_eq!(replayed.text("/expect/first/how"), "extra");
+    } else {
+        assert!(replayed.text("/expect/first/text").contains("\n  recorded  sensors "), "{:#}", replayed.0);
+    }
     // The counters show that the recording is the cause.
     place.write("gone.log", &gone);
     let (ended, replayed) = place.replayed("gone.log", &format!("{FRESH} --speed max"));
@@ -388,7 +393,9 @@ fn a_foreign_capture_goes_to_another_bus_as_it_is() {
     ended.succeeded();
     let ended = dump.end().succeeded();
     let seen: Vec<_> = ended.stdout.lines().map(|line| line.split([' ', '\t']).nth(2).unwrap()).collect();
-    assert_eq!(seen, ["123#DEADBEEF", "1F334455#R4", "00C##7AABB", "7FF#"]);
+    // The frames of one recorded bus keep their order; those of two buses may overtake each other on a busy machine.
+    let (of_can8, of_can7): (Vec<_>, Vec<_>) = seen.iter().partition(|frame| frame.starts_with("00C"));
+    assert_eq!((of_can7, of_can8), (vec!["123#DEADBEEF", "1F334455#R4", "7FF#"], vec!["00C##7AABB"]));
     assert_eq!(replayed.number("/sent"), 4);
     assert_eq!(replayed.0["skipped"], serde_json::json!({"error frame": 1, "note": 1}));
 }
