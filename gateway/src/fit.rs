@@ -43,8 +43,8 @@ const FOR_TRAFFIC: &str = "Options for traffic";
   skinbus fit vcan0 vcan1 --duration 10")]
 pub(crate) struct FitCommand {
     /// Skin file, of which the worst case is computed; or recorded frames, in a candump log or an MCAP
-    /// recording (all parts of a split one); or live buses. - reads standard input: a skin with --table, --format or
-    /// --computation, else frames
+    /// recording (all parts of a split one); or live buses. `-` is standard input: a skin if --table, --format or
+    /// --computation is given, else frames
     #[arg(value_name = "SKIN|FILE|BUS", required = true)]
     sources: Vec<PathBuf>,
     /// Nominal bit rate in bit/s, used for identifiers and for whole classic frames, such as 1000000, 500k or 1M

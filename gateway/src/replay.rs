@@ -292,7 +292,7 @@ fn comparison_rows(rows: &mut KeyValueTable, expect: &ReplyComparison) {
         skipped => format!("cells skipped {skipped} late joints messages"),
     };
     rows.add_row("missing", tally.missing, late);
-    rows.add_row("extra", tally.extra, "");
+    rows.add_row("extra", tally.extra, "not in the recording");
     rows.add_row_unless_zero("not requested", tally.not_requested, "a bus refused the joints message");
     for (reason, count) in tally.lacking.reason_counts() {
         rows.add_row("not recorded", count, reason);

@@ -285,7 +285,7 @@ fn format_force_steps(force: &ForceSteps, zero: u64) -> String {
          proximity  F_p = {proximity:.4}, {near} its threshold of {proximity_threshold:.4}: {near_counts}\n  \
          force      F_z = {alpha_c:.4} F_c + {alpha_p_n:.4} F_p = {fused_n:.6} N, {fused} its threshold of \
          {force_threshold_n:.4} N\n  \
-         in words   {force_steps} steps of 2^-16 N = {force_n:.6} N\n"
+         in steps   {force_steps} of 2^-16 N = {force_n:.6} N\n"
     )
 }
 

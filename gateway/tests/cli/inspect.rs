@@ -257,7 +257,7 @@ fn the_worked_example_of_the_document_is_explained_in_a_terminal() {
         "  contact    F_c = 3.0000 N, at least its threshold of 0.1006 N: counts",
         "  proximity  F_p = 0.0000, below its threshold of 0.0500: does not count",
         "  force      F_z = 1.0000 F_c + 0.0000 F_p = 3.000000 N, at least its threshold of 0.1006 N",
-        "  in words   196608 steps of 2^-16 N = 3.000000 N",
+        "  in steps   196608 of 2^-16 N = 3.000000 N",
         "  answered   0.500 ms after the joints message",
         "  vcan0 12: it did not report its configuration hash, which is assumed to be that of the skin, 266D",
         "  vcan0: 1 cells sent nothing, and their contact state is not in the capture; they are assumed not to be in contact",

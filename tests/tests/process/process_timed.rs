@@ -207,7 +207,10 @@ fn a_run_on_a_timed_bus_accounts_for_each_reply() {
     );
     assert_eq!(timed["sent"], timed["requested"], "{timed}");
     let bound = &summary.0["buses"][0]["last_reply_bound_us"];
-    assert!(bound.as_f64() > Some(0.0) && ended.stdout.contains("bound of fit"), "{bound} {}", ended.stdout);
+    // The table breaks its texts into lines.
+    let words =
+        ended.stdout.split([' ', '\n', '│']).filter(|word| !word.is_empty()).collect::<Vec<_>>().join(" ");
+    assert!(bound.as_f64() > Some(0.0) && words.contains(" by `skinbus fit`"), "{bound} {}", ended.stdout);
     assert_eq!((timed["refused"].as_u64(), timed["waiting"].as_u64()), (Some(0), Some(0)), "{timed}");
     assert!(timed["beside"].as_u64() > Some(0) && timed["load"].as_f64() > Some(0.0), "{timed}");
     // The report says it, and shows the latest reply beside the bound.

@@ -74,7 +74,7 @@ pub(super) fn add_timed_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verb
 pub(super) fn last_reply_remark(bus: &BusSummary, untimed: &str) -> String {
     match (&bus.timed, bus.last_reply_bound_us) {
         (None, _) => untimed.to_owned(),
-        (Some(_), Some(bound)) => format!("after the joints message; bound of fit {bound:.0}"),
+        (Some(_), Some(bound)) => format!("after the joints message; at most {bound:.0} by `skinbus fit`"),
         (Some(_), None) => "after the joints message; fit has no bound".to_owned(),
     }
 }
