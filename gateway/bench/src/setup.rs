@@ -38,3 +38,30 @@ pub(crate) fn format_cells(cells: &[CellId], place: &str) -> String {
         _ => numbers.join(", ") + place,
     }
 }
+
+/// Formats cells as the subject of a sentence: `cell 1`, `cells 1, 2, 5`, `100 cells (1, 2, 3, 4, 5, 6 ...)`.
+pub(crate) fn format_as_subject(cells: &[CellId], place: &str) -> String {
+    let cells_there = format_cells(cells, place);
+    match cells.len() {
+        1 => format!("cell {cells_there}"),
+        13.. => cells_there,
+        _ => format!("cells {cells_there}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cells_are_the_subject_of_a_sentence() {
+        let text = |count| {
+            let cells: Vec<_> = (1..=count).map(|node| CellId::new(node).unwrap()).collect();
+            format_as_subject(&cells, " on vcan0")
+        };
+        assert_eq!(text(1), "cell 1 on vcan0");
+        assert_eq!(text(2), "cells 1, 2 on vcan0");
+        assert_eq!(text(12), "cells 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12 on vcan0");
+        assert_eq!(text(13), "13 cells on vcan0 (1, 2, 3, 4, 5, 6 ...)");
+    }
+}

@@ -177,7 +177,7 @@ fn cells_of_another_host_answer_as_if_they_were_here() {
     });
     let of = |pointer: &str| bus.pointer(pointer).unwrap().as_u64().unwrap();
     assert_eq!((of("/hosts/0/gone"), of("/uplink/hosts")), (0, 0), "{bus:#}");
-    assert!(ended.stderr.contains("host 'cells' of vcan0 is linked"), "{}", ended.stderr);
+    assert!(ended.stderr.contains("host 'cells' of vcan0 is connected"), "{}", ended.stderr);
     assert!(ended.stdout.contains("host cells") && ended.stdout.contains("12 cells"), "{}", ended.stdout);
     pair.end();
 }
@@ -187,7 +187,7 @@ fn cells_of_another_host_answer_as_if_they_were_here() {
 fn a_connection_that_is_cut_is_made_again_and_each_missing_reply_explained() {
     let mut pair = Pair::new();
     let (_, bus) = pair.bench(|pair, bench| {
-        bench.wait_for_stderr("host 'cells' of vcan0 is linked");
+        bench.wait_for_stderr("host 'cells' of vcan0 is connected");
         pair.proxy.cut(true);
         bench.wait_for_stderr("host 'cells' of vcan0 is gone or unreachable");
         bench.wait_for_stderr("fallen silent");
@@ -204,7 +204,7 @@ fn a_connection_that_is_cut_is_made_again_and_each_missing_reply_explained() {
 fn a_connection_that_falls_silent_is_noticed_and_made_again() {
     let mut pair = Pair::new();
     let (_, bus) = pair.bench(|pair, bench| {
-        bench.wait_for_stderr("host 'cells' of vcan0 is linked");
+        bench.wait_for_stderr("host 'cells' of vcan0 is connected");
         pair.proxy.stall(true);
         bench.wait_for_stderr("host 'cells' of vcan0 is gone or unreachable");
         pair.proxy.stall(false);
@@ -219,7 +219,7 @@ fn a_connection_that_falls_silent_is_noticed_and_made_again() {
 fn links_that_are_killed_are_joined_again() {
     let mut pair = Pair::new();
     let (ended, bus) = pair.bench(|pair, bench| {
-        bench.wait_for_stderr("host 'cells' of vcan0 is linked");
+        bench.wait_for_stderr("host 'cells' of vcan0 is connected");
         pair.cells_link.signal(Signal::KILL);
         bench.wait_for_stderr("host 'cells' of vcan0 is gone or unreachable");
         // A link that is back after 40 ms loses nothing visible.
@@ -238,7 +238,7 @@ fn the_link_of_the_gateways_host_may_be_killed() {
     let mut pair = Pair::new();
     let listen = format!("--listen tcp/127.0.0.1:{}", pair.proxy.to);
     let (_, bus) = pair.bench(|pair, bench| {
-        bench.wait_for_stderr("host 'cells' of vcan0 is linked");
+        bench.wait_for_stderr("host 'cells' of vcan0 is connected");
         pair.robot_link.signal(Signal::KILL);
         bench.wait_for_stderr("the link of vcan0 to other hosts has ended");
         pair.robot_link = pair.robot.link(&listen);
@@ -253,7 +253,7 @@ fn the_link_of_the_gateways_host_may_be_killed() {
 fn a_connection_with_a_delay_of_20_ms_makes_replies_late_and_none_unexplained() {
     let mut pair = Pair::new();
     let (_, bus) = pair.bench(|pair, bench| {
-        bench.wait_for_stderr("host 'cells' of vcan0 is linked");
+        bench.wait_for_stderr("host 'cells' of vcan0 is connected");
         pair.proxy.delay(Duration::from_millis(20));
         pair.robot.place.test_client().waits_for_joints(100);
     });
@@ -374,7 +374,7 @@ fn two_network_namespaces_and_a_cable_that_is_pulled() {
     robot_link.wait_for_stderr("host 'cells' has joined");
     let _cells = cells.cells();
     let bench = robot.bench();
-    bench.wait_for_stderr("host 'cells' of vcan0 is linked");
+    bench.wait_for_stderr("host 'cells' of vcan0 is connected");
     ip("-n robot link set cable down");
     bench.wait_for_stderr("host 'cells' of vcan0 is gone or unreachable");
     ip("-n robot link set cable up");

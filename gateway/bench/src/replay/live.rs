@@ -18,7 +18,7 @@ use super::shared_state::SharedState;
 use super::start::{ReplayBus, mode_message};
 use super::{ReplayError, ReplayOptions};
 use crate::bus::realtime;
-use crate::setup::format_cells;
+use crate::setup::format_as_subject;
 
 /// Interval in ns between checks of the stop flag.
 const STOP_POLL_INTERVAL_NS: u64 = 100_000_000;
@@ -243,10 +243,10 @@ impl LiveBackend {
                 let late = comparator.time_out_cells(bus_index);
                 let name = self.shared_state.checks.bus_name(bus_index);
                 self.lockstep.silent_cells.extend(late.iter().map(|cell| format!("{cell} on {name}")));
-                let (plural, verb) = if late.len() == 1 { ("", "does") } else { ("s", "do") };
+                let verb = if late.len() == 1 { "does" } else { "do" };
                 self.notify(format!(
-                    "cell{plural} {} on {name} {verb} not answer within {} s: the replay continues",
-                    format_cells(&late, ""),
+                    "{} {verb} not answer within {} s: the replay continues",
+                    format_as_subject(&late, &format!(" on {name}")),
                     ANSWER_TIMEOUT.as_secs()
                 ));
                 return;

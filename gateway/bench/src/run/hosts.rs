@@ -8,7 +8,7 @@ use protocol::id::CellId;
 use vcan_setup::hosts::report::{HostReport, LinkReport, ReportReader};
 
 use crate::bus::link::{Outages, SharedBus};
-use crate::setup::format_cells;
+use crate::setup::format_as_subject;
 use crate::summary::HostSummary;
 
 /// Interval between attempts to connect to a link.
@@ -133,9 +133,12 @@ impl KnownHosts {
                     known.outages.begin_outage(now);
                     "is gone or unreachable"
                 };
-                let of_it = format_cells(&cells, "");
-                let of_it = if cells.is_empty() { String::new() } else { format!(" (cells {of_it})") };
-                changes.notes.push(format!("host '{host}' of {bus} {how}{of_it}"));
+                let cells = if cells.is_empty() {
+                    String::new()
+                } else {
+                    format!(", with {}", format_as_subject(&cells, ""))
+                };
+                changes.notes.push(format!("host '{host}' of {bus} {how}{cells}"));
             }
             let is_disturbed = !is_first
                 && (before.is_there != newest.is_there
@@ -203,7 +206,10 @@ mod tests {
     fn what_was_lost_before_the_run_is_not_the_runs() {
         let mut of = Fixture::new();
         let (notes, in_doubt, _) = of.take(&[("b", true, 1, 50, 60)]);
-        assert_eq!((notes, in_doubt), (vec!["host 'b' of vcan0 is connected (cells 7, 9)".to_owned()], 0));
+        assert_eq!(
+            (notes, in_doubt),
+            (vec!["host 'b' of vcan0 is connected, with cells 7, 9".to_owned()], 0)
+        );
         assert_eq!(of.0.lost_frames(), 0);
         assert_eq!(of.take(&[("b", true, 1, 53, 60)]), (vec![], 0, 0), "their own counts show it");
         assert_eq!(of.take(&[("b", true, 1, 53, 64)]), (vec![], 2, 2), "stimuli may be among them");
@@ -218,7 +224,7 @@ mod tests {
         let mut of = Fixture::new();
         of.take(&[("b", true, 1, 0, 0), ("c", true, 1, 0, 0)]);
         let (notes, in_doubt, reached) = of.take(&[("b", false, 1, 0, 0), ("c", true, 1, 0, 0)]);
-        assert_eq!(notes, ["host 'b' of vcan0 is gone or unreachable (cells 7, 9)"]);
+        assert_eq!(notes, ["host 'b' of vcan0 is gone or unreachable, with cells 7, 9"]);
         assert_eq!((in_doubt, reached), (2, 0));
         assert!(
             of.0.is_host_unreachable(CellId::new(7).unwrap())
@@ -226,7 +232,7 @@ mod tests {
         );
         let (notes, in_doubt, reached) = of.take(&[("b", true, 2, 0, 0), ("c", true, 1, 0, 0)]);
         assert!(!of.0.is_host_unreachable(CellId::new(7).unwrap()));
-        assert_eq!(notes, ["host 'b' of vcan0 is reachable again (cells 7, 9)"]);
+        assert_eq!(notes, ["host 'b' of vcan0 is reachable again, with cells 7, 9"]);
         assert_eq!((in_doubt, reached), (2, 2));
         assert_eq!(
             of.take(&[("b", true, 3, 0, 0), ("c", true, 1, 0, 0)]).1,
