@@ -163,7 +163,7 @@ impl LiveState {
     }
 
     /// Returns two torques for each joint of the robot in the last completed epoch, in Nm or N: the distributed and the
-    /// central one.
+    /// central one, which is NaN while a touched cell's sensor values are unknown.
     #[must_use]
     pub fn joint_torques(&self) -> Vec<[f64; 2]> {
         self.joint_positions_and_torques()
@@ -172,7 +172,8 @@ impl LiveState {
             .collect()
     }
 
-    /// Returns three values for each joint of the robot: position, distributed torque and central torque.
+    /// Returns three values for each joint of the robot: position, distributed torque and central torque, which is NaN
+    /// while unknown.
     pub(crate) fn joint_positions_and_torques(&self) -> Vec<[f64; 3]> {
         let mut rows = vec![[0.0_f64; 3]; self.skin.robot.joints.len()];
         for (index, bus) in self.buses.iter().enumerate() {

@@ -94,7 +94,8 @@ impl ControlBus {
         self.live.previous.is_some()
     }
 
-    /// Returns position, distributed torque and central torque of each joint of the chain.
+    /// Returns position, distributed torque and central torque of each joint of the chain; the latter is NaN while
+    /// unknown.
     pub(super) fn joint_values(&self) -> Vec<[f64; 3]> {
         let torques = self.live.joint_torques().enumerate();
         torques
@@ -163,6 +164,7 @@ impl ControlBus {
             joints.distributed.push(distributed);
             joints.central.push(central);
         }
+        joints.clear_unknown_central();
         let (bus, epoch) = (self.name().to_owned(), ended.epoch.0);
         ControlEvent::Epoch { bus, epoch, number: self.number, at_ns, joints }
     }

@@ -201,8 +201,18 @@ pub struct JointTorques {
     pub positions: Vec<f64>,
     /// The sums of the torques that the cells sent, in Nm or N; empty before the first complete epoch.
     pub distributed: Vec<f64>,
-    /// The torques computed centrally from the cells' stimuli, in Nm or N; empty before the first complete epoch.
+    /// The torques computed centrally from the cells' stimuli, in Nm or N; empty before the first complete epoch, and
+    /// while a touched cell's sensor values are unknown.
     pub central: Vec<f64>,
+}
+
+impl JointTorques {
+    /// Removes the central torques if any of them is NaN: they are unknown.
+    pub(super) fn clear_unknown_central(&mut self) {
+        if self.central.iter().any(|torque| torque.is_nan()) {
+            self.central.clear();
+        }
+    }
 }
 
 /// The state of a bus in a report.

@@ -417,6 +417,7 @@ impl ControlState {
             all.distributed.clear();
             all.central.clear();
         }
+        all.clear_unknown_central();
         let lateness_us = Some(lateness_us).filter(|lateness| lateness.count > 0);
         ControlEvent::Report { id, buses, joints: all, cells, lateness_us, skipped }
     }

@@ -104,7 +104,11 @@ impl LiveTopics {
         let nanos = contacts.at_nanos;
         let column = |place: fn(&[f64; 3]) -> f64| joints.iter().map(place).collect::<Vec<_>>();
         let (position, effort) = (column(|[position, ..]| *position), column(|[_, effort, _]| *effort));
-        let central = column(|[.., central]| *central);
+        let mut central = column(|[.., central]| *central);
+        if central.iter().any(|torque| torque.is_nan()) {
+            // Unknown, as in ticks without a central computation.
+            central.clear();
+        }
         let names = &layout.joints;
         let state = JointState { nanos, names, position: &position, velocity: &[], effort: &effort };
         topics.write_joint_states(sink, &state);

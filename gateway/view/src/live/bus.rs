@@ -59,7 +59,8 @@ pub(crate) struct LiveBus {
     /// The joint positions of the current epoch; `before` has those of the previous one.
     pub(crate) current: Option<BroadcastJoints>,
     pub(crate) previous: Option<BroadcastJoints>,
-    /// The distributed and the central torque of each joint of the chain in the last completed epoch.
+    /// The distributed and the central torque of each joint of the chain in the last completed epoch; the central ones
+    /// are NaN while they are unknown.
     torques: [(f64, f64); MAX_JOINTS],
     joints: usize,
     /// The last torque of each cell with its time, by the cell's index on the bus.
@@ -116,7 +117,7 @@ impl LiveBus {
         match message {
             Some(Message::Joints { epoch, joints: said }) => {
                 joints = true;
-                self.close_epoch();
+                self.close_epoch(at);
                 let heard = BroadcastJoints { epoch, positions: said.positions };
                 self.previous = self.current.replace(heard);
                 self.timed.iter_mut().for_each(|timed| timed.replies.handle_joints(at, epoch));
@@ -151,13 +152,20 @@ impl LiveBus {
     }
 
     /// Completes the epoch before new joints: stores the sum of the torques received, and the torque computed
-    /// centrally.
-    fn close_epoch(&mut self) {
+    /// centrally, which is unknown while a cell is touched whose sensor values are unknown.
+    fn close_epoch(&mut self, at: Micros) {
         let Some(heard) = self.current else { return };
         let frames = self.central.link_frames(&heard.positions);
-        let cells = self.table.cells().iter();
-        let sensors: Vec<_> = cells.map(|cell| cell.presumed_sensors().unwrap_or_default()).collect();
-        let central = self.central.total_torque(&frames, &sensors).torque;
+        let is_unknown = |(sensors, status): (Option<SkinSensors>, CellStatus)| {
+            sensors.is_none() && matches!(status, CellStatus::Active | CellStatus::Stale)
+        };
+        let central = if self.table.presumed_sensors(at).any(is_unknown) {
+            [f64::NAN; MAX_JOINTS]
+        } else {
+            let cells = self.table.cells().iter();
+            let sensors: Vec<_> = cells.map(|cell| cell.presumed_sensors().unwrap_or_default()).collect();
+            self.central.total_torque(&frames, &sensors).torque
+        };
         let distributed = self.table.snapshot().sums.torque;
         for ((torque, distributed), central) in self.torques.iter_mut().zip(distributed).zip(central) {
             *torque = (distributed, central);
@@ -238,7 +246,7 @@ impl LiveBus {
         self.table.presumed_sensors(now).nth(self.table.index_of(node)?)?.0
     }
 
-    /// Returns the distributed and the central torque of each joint of the chain.
+    /// Returns the distributed and the central torque of each joint of the chain; the latter is NaN while unknown.
     pub(crate) fn joint_torques(&self) -> impl Iterator<Item = (f64, f64)> {
         self.torques.into_iter().take(self.joints)
     }

@@ -9,7 +9,7 @@ use protocol::id::Node;
 use protocol::message::{
     Heartbeat, Joints, Message, NetworkPage, SensorPage, State, StimulusStart, TreePage,
 };
-use protocol::packet::{Epoch, Packet};
+use protocol::packet::{Epoch, Packet, Words};
 
 fn skin() -> Skin {
     Skin::parse("ur5", include_str!("../../../examples/ur5-253.toml")).unwrap()
@@ -130,6 +130,25 @@ fn a_snapshot_holds_the_last_epoch_that_is_over() {
     for other in ["254", "0", "vcan7:1", "five"] {
         assert_eq!(bench.live.cell_detail(&selected(other), bench.now), None, "{other}");
     }
+}
+
+#[test]
+fn a_touch_from_before_the_view_makes_the_central_torque_unknown_until_it_ends() {
+    let mut bench = Bench::new();
+    let node = CellId::new(5).unwrap();
+    let (quiet, touched) = (Words::from([0; 6]), Words::from([100, -200, 0, 0, 0, 0]));
+    let mut both_torques = |epoch: u8, torque: Words| {
+        bench.heartbeat(5, 0);
+        bench.joints(epoch, Q);
+        bench.say(&Message::Torque { from: node, epoch: Epoch(epoch), torque });
+        bench.joints(epoch + 1, Q);
+        let bytes = bench.snapshot();
+        (float(&bytes, 24 + 4), float(&bytes, 24 + 8))
+    };
+    let (distributed, central) = both_torques(1, touched);
+    assert_eq!(distributed, 100.0 / 4096.0);
+    assert!(central.is_nan(), "no stimulus was seen: {central}");
+    assert_eq!(both_torques(3, quiet), (0.0, 0.0), "the torque of 0 Nm ended the contact");
 }
 
 #[test]

@@ -52,8 +52,13 @@ impl Played {
     }
 
     fn beat(&mut self) {
+        self.beat_with(0);
+    }
+
+    /// Sends a heartbeat of a cell that has sent this many packets since its start.
+    fn beat_with(&mut self, sent: u16) {
         let state = State(State::CONFIGURED.0 | State::TEST_MODE.0);
-        let page = NetworkPage::Heartbeat(Heartbeat { state, ..Heartbeat::default() });
+        let page = NetworkPage::Heartbeat(Heartbeat { state, sent, ..Heartbeat::default() });
         let from = Node::Cell(CellId::new(1).unwrap());
         self.receive(&Message::Network { from, epoch: Epoch(self.epoch), page });
     }
@@ -275,4 +280,21 @@ fn cells_on_a_lost_bus_stay_pressed_until_they_can_be_released() {
     let events = played.line(&json!({"do": "release", "id": 3}));
     let accepted = json!({"event": "accepted", "id": 3, "do": "release", "text": "release 1 cells"});
     assert_eq!(events.last(), Some(&accepted));
+}
+
+#[test]
+fn a_touch_that_no_stimulus_explains_leaves_the_central_torques_unknown() {
+    let mut played = Played::new();
+    played.beat_with(100);
+    played.begin_epoch();
+    played.answer_joints(played.epoch, 2.0);
+    played.begin_epoch();
+    played.begin_epoch();
+    played.answer(&[]);
+    played.state.handle_time(played.now());
+    played.events();
+    let report = played.line(&json!({"do": "report"})).remove(0);
+    let distributed = report["distributed"].as_array().unwrap();
+    assert!(distributed.iter().any(|torque| *torque != json!(0.0)), "{report}");
+    assert_eq!(report["central"], json!([]));
 }
