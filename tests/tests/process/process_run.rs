@@ -16,7 +16,7 @@ use protocol::parameters::Parameter;
 use rustix::process::{Pid, Signal};
 
 /// Checks that every frame on the buses is in the log: packets by their kinds, as both sides counted them, and other
-/// frames.
+/// frames. If a packet is two frames, the first packet of a cell may have begun before the log.
 fn log_is_whole(place: &TestDir, summary: &Summary, frames_a_packet: u64) {
     let buses = summary.0["buses"].as_array().unwrap().len();
     let packets = |bus| {
@@ -25,7 +25,9 @@ fn log_is_whole(place: &TestDir, summary: &Summary, frames_a_packet: u64) {
     let counted: u64 = (0..buses).map(packets).sum::<u64>() * frames_a_packet;
     let lines = place.read("run.log").lines().count();
     assert_eq!(summary.number("/recording/frames"), u64::try_from(lines).unwrap());
-    assert_eq!((lines as u64, summary.number("/recording/lost")), (counted, 0), "{:#}", summary.0);
+    let halves = if frames_a_packet == 1 { 0 } else { summary.cells().len() as u64 };
+    assert!((counted..=counted + halves).contains(&(lines as u64)), "{lines} of {counted}: {:#}", summary.0);
+    assert_eq!(summary.number("/recording/lost"), 0, "{:#}", summary.0);
     assert_eq!(summary.0["recording"]["files"][0]["path"], "run.log");
 }
 
