@@ -192,7 +192,6 @@ fn publish_and_execute(
                 stop.store(true, Ordering::Relaxed);
             }
         }
-        server.take_disconnected_pages().into_iter().for_each(|page| pressed.release(page));
         let now = time_of_read_frames(buses);
         let due = {
             let mut live = lock_ignoring_poison(live);

@@ -29,7 +29,7 @@ use crate::token::Token;
 
 /// The maximum number of pages at the same time.
 const MAX_PAGES: usize = 16;
-/// The maximum number of commands that wait to be executed. Further ones are dropped and counted.
+/// The maximum number of commands that wait to be executed. Pages that send more wait.
 const COMMAND_QUEUE_SIZE: usize = 256;
 
 /// The rights of the pages, and the token that they need.
@@ -51,7 +51,7 @@ pub struct ServerCounts {
     /// The number of refused requests: for another host, from another site, without the token, too slow, too many, or
     /// for a missing file.
     pub refused: u64,
-    /// The number of messages from pages that were not commands, were not allowed, or found the queue full.
+    /// The number of messages from pages that were not commands, or were not allowed.
     pub ignored: u64,
 }
 
@@ -82,7 +82,6 @@ struct ServerState {
     recording: OnceLock<RecordedCurves>,
     newest: Mutex<LatestMessages>,
     chosen: Mutex<BTreeMap<u64, SelectedCell>>,
-    gone: Mutex<Vec<u64>>,
     commands: SyncSender<(u64, PageCommand)>,
     stop: AtomicBool,
     pages: AtomicUsize,
@@ -147,7 +146,6 @@ impl Server {
             recording: OnceLock::new(),
             newest: Mutex::default(),
             chosen: Mutex::default(),
-            gone: Mutex::default(),
             commands: sender,
             stop: AtomicBool::new(false),
             pages: AtomicUsize::new(0),
@@ -195,20 +193,15 @@ impl Server {
         }
     }
 
-    /// Returns the commands that pages have sent since the last call, each with the number of the page.
+    /// Returns the next commands of pages, each with the number of the page: at most as many as wait, so that a flood
+    /// does not hold the caller. The last command of a page that may act is a release, when it disconnects.
     pub fn commands(&self) -> impl Iterator<Item = (u64, PageCommand)> + '_ {
-        self.commands.try_iter()
+        self.commands.try_iter().take(COMMAND_QUEUE_SIZE)
     }
 
     /// Counts a command that was not executed.
     pub fn count_ignored_command(&self) {
         self.shared.ignored.fetch_add(1, Ordering::Relaxed);
-    }
-
-    /// Returns the numbers of the pages that have disconnected since the last call.
-    #[must_use]
-    pub fn take_disconnected_pages(&self) -> Vec<u64> {
-        std::mem::take(&mut *lock_ignoring_poison(&self.shared.gone))
     }
 
     /// Returns the cell that each page has selected, by the number of the page.

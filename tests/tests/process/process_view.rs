@@ -119,7 +119,7 @@ fn who_is_no_page_of_this_server_is_refused_and_floods_end_nothing() {
     let stalled = Page::new(&address);
     let mut flood = Page::new(&address);
     let flooding = std::thread::spawn(move || {
-        for number in 0..100_000_u32 {
+        for number in 0..20_000_u32 {
             let text = match number % 8 {
                 0 => "{\"do\":\"press\",\"cell\":\"vcan9:1\",\"force_n\":1}".to_owned(),
                 1 => format!("{{\"do\":\"choose\",\"cell\":{}}}", number % 256),
@@ -134,9 +134,6 @@ fn who_is_no_page_of_this_server_is_refused_and_floods_end_nothing() {
                 break;
             }
         }
-        // The server closes the connection once it has read everything, so no release follows the press below.
-        let _ = flood.socket.close(None);
-        while flood.socket.read().is_ok() {}
     });
     let mut page = Page::new(&address);
     let mut seen = 0;

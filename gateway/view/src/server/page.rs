@@ -9,6 +9,7 @@ use tungstenite::protocol::WebSocketConfig;
 use tungstenite::{Error, Message, WebSocket, accept_with_config};
 
 use super::ServerState;
+use crate::command::ControlCommand;
 use crate::lock_ignoring_poison;
 use crate::page_command::{MAX_MESSAGE_BYTES, PageCommand, SelectionCommand};
 
@@ -82,7 +83,11 @@ fn serve_websocket(begun: PrefixedStream, page: u64, shared: &ServerState) -> io
     shared.clients.fetch_add(1, Ordering::Relaxed);
     let ended = exchange_messages(&mut socket, page, shared);
     lock_ignoring_poison(&shared.chosen).remove(&page);
-    lock_ignoring_poison(&shared.gone).push(page);
+    if shared.access.may_act {
+        // In the queue, the release follows the page's last press.
+        let release = PageCommand::Control(ControlCommand::Release { cell: None });
+        let _ = shared.commands.send((page, release));
+    }
     if ended.is_ok() {
         let _ = socket.close(None);
         let _ = socket.flush();
@@ -150,8 +155,9 @@ fn handle_message(text: &str, page: u64, shared: &ServerState) {
         }
         Some(PageCommand::Control(_)) if !shared.access.may_act => ignore(),
         Some(PageCommand::Playback(_)) if !shared.access.may_play => ignore(),
+        // A full queue delays the page that fills it; a press or a halt of another page must not be lost.
         Some(command) => {
-            if shared.commands.try_send((page, command)).is_err() {
+            if shared.commands.send((page, command)).is_err() {
                 ignore();
             }
         }

@@ -6,6 +6,7 @@ use tungstenite::client::IntoClientRequest;
 use tungstenite::{WebSocket, client};
 
 use super::*;
+use crate::command::ControlCommand;
 
 const TOKEN: &str = "abcdef0123456789";
 /// The time within which operations must finish that should finish at once.
@@ -107,6 +108,37 @@ fn bytes_behind_a_head_do_not_change_its_answer() {
         .unwrap();
     assert_eq!(status(&rest(stream)), "403");
     assert_eq!(server.commands().count(), 0);
+}
+
+#[test]
+fn no_command_is_lost_while_another_page_sends_more_than_fit() {
+    let server = served(None);
+    let count = 3 * COMMAND_QUEUE_SIZE;
+    let [mut flood, mut other] = [(), ()].map(|()| page(&server, "").unwrap());
+    for _ in 0..count {
+        flood.send(tungstenite::Message::text(r#"{"do":"resume"}"#)).unwrap();
+    }
+    let give_up = Instant::now() + TIMEOUT;
+    let mut taken = server.commands().count();
+    assert!(taken <= COMMAND_QUEUE_SIZE, "{taken}");
+    other.send(tungstenite::Message::text(r#"{"do":"halt"}"#)).unwrap();
+    while taken < count + 1 {
+        assert!(Instant::now() < give_up, "{taken} of {} commands", count + 1);
+        taken += server.commands().count();
+        thread::sleep(Duration::from_millis(1));
+    }
+    assert_eq!(server.counts().ignored, 0);
+
+    other.send(tungstenite::Message::text(r#"{"do":"press","cell":1,"force_n":1}"#)).unwrap();
+    drop(other);
+    let mut of_other = Vec::new();
+    while of_other.len() < 2 {
+        assert!(Instant::now() < give_up, "{of_other:?}");
+        of_other.extend(server.commands().map(|(_, command)| command));
+        thread::sleep(Duration::from_millis(1));
+    }
+    let release = PageCommand::Control(ControlCommand::Release { cell: None });
+    assert_eq!(of_other[1], release, "after the press");
 }
 
 #[test]
