@@ -52,8 +52,8 @@ struct Arguments {
     reconnect: bool,
     #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto, help = BusKind::help())]
     bus_kind: KindChoice,
-    /// Sine function for the torques: eighths, or seventh-order, as in recordings of earlier builds. It affects only
-    /// the last bits, which `skinbus replay` compares
+    /// Sine approximation for the torques: eighths; or seventh-order, to replay recordings of earlier builds with all
+    /// bits equal
     #[arg(long, value_name = "NAME", default_value_t)]
     sine: SineMethod,
     /// Exit when the parent process with this id ends

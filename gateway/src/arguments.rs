@@ -76,8 +76,8 @@ pub(crate) struct BusKinds {
 /// The option for the time that frames take on embedded buses.
 #[derive(Args, Clone, Copy, Debug)]
 pub(crate) struct BusTimeOption {
-    /// Let frames on embedded buses take time: none; real, as long as on a real bus at the skin's bit rates (else 1M/5M);
-    /// or real:fifo:10 or real:priority:32, to choose the transmit queue too [default: as the skin says, else none]
+    /// Time that frames take on embedded buses: none; real, from the skin's bit rates (else 1M/5M); or, with a transmit
+    /// queue of N frames, real:fifo:N or real:priority:N [default: as the skin says, else none]
     #[arg(long, value_name = "TIME")]
     bus_time: Option<BusTimeChoice>,
 }
@@ -90,9 +90,9 @@ impl BusTimeOption {
 
 fn kinds_help() -> String {
     format!(
-        "Bus kind: {}. Default: socketcan if an interface has this name, else embedded. For one of several buses, \
-         BUS=KIND; repeat the option for further buses",
-        BusKind::names()
+        "Kind of all buses, or as BUS=KIND of one (repeatable): {}. Default: auto, socketcan if the bus has an \
+         interface of its name, else embedded",
+        BusKind::choices()
     )
 }
 

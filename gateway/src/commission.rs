@@ -41,7 +41,7 @@ pub(crate) struct CommissionCommand {
     bus: Option<String>,
     #[command(flatten)]
     kinds: BusKinds,
-    /// Write nothing to the cells: only list those found, and those that would be written
+    /// Write nothing to the cells: only list those found, and which of them need writing
     #[arg(long)]
     dry_run: bool,
     /// Also read back and compare the parameters of cells whose configuration hash is already right

@@ -62,10 +62,10 @@ pub(crate) struct CompareCommand {
     /// The MCAP recording or candump log to compare A with
     #[arg(value_name = "B")]
     b: PathBuf,
-    /// Skin file of both [default: the skin in a recording]
+    /// Skin file of A and B [default: the skin in A or B]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// Accept torques that differ by up to this many steps; a step is 1/4096 Nm, for sums 1/256 Nm
+    /// Accept torques that differ by up to this many steps: 1/4096 Nm in Q3.12, 1/256 Nm in sums
     #[arg(long, value_name = "STEPS", default_value_t = 0)]
     tolerance: u16,
     /// Accept joint positions that differ by up to this many steps; a step is 1/16384 of a quarter turn or of a metre

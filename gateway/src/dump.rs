@@ -49,13 +49,13 @@ use super::print::{comma_separated, to_pretty_json};
   skinbus dump can0 --stats --to 10
   candump -L can0 | skinbus dump - -n 100")]
 pub(crate) struct DumpCommand {
-    /// Names of buses to listen to; or candump logs or MCAP recordings; - for standard input. A name is a file if that
-    /// file exists. The parts of a split recording are read as one, in any order
+    /// Names of buses to listen to; or candump logs or MCAP recordings; - for standard input. A name means a file if one
+    /// exists. The parts of a split recording are read as one, in any order
     #[arg(required = true, value_name = "BUS|FILE")]
     sources: Vec<PathBuf>,
-    /// Show only frames of these kinds: command, sum, torque, sensors, network, configure, configured, stimulus, wire,
-    /// foreign (frames of other protocols, and all damaged ones), damaged (only these); or these commands: halt,
-    /// joints, sync, resume, report
+    /// Show only frames of these kinds: command, sum, torque, sensors, network, configure, configured, stimulus, wire
+    /// (simulated wires), foreign (of other protocols, or damaged), damaged (under an identifier that carries packets);
+    /// or these commands: halt, joints, sync, resume, report
     #[arg(long, value_name = "KIND", value_delimiter = ',')]
     kind: Vec<FrameSelector>,
     /// Show only packets from or to these nodes: a node id, BUS:NODE, gateway or everyone
@@ -91,14 +91,14 @@ pub(crate) struct DumpCommand {
     /// Print tables at the end instead of lines: frames and rates by kind, gaps, losses, damaged frames, a line for
     /// each cell and for each foreign identifier
     ///
-    /// Counts a live bus until --to, --count or Ctrl-C. Excluded frames would falsify the numbers of losses
-    /// and unanswered joints; so of the filters only --bus, --from, --to and --count are allowed.
+    /// Counts a live bus until --to, --count or Ctrl-C. Other filters would hide frames, and so falsify losses and
+    /// unanswered joints messages: only --bus, --from, --to and --count are allowed.
     #[arg(long, conflicts_with_all = ["kind", "cell", "id", "contact"])]
     stats: bool,
     /// Frame format of the packets: FD, classic, or auto for both
     #[arg(long, value_parser = one_of_values(ANY_FORMAT), default_value = "auto")]
     format: PacketFormat,
-    /// Skin file, from which the units of torques and positions are known [default: the skin in the recording]
+    /// Skin file that gives the units of torques and positions [default: the skin in the recording]
     ///
     /// Without a skin, torques are decoded as Q3.12, and joints as revolute.
     #[arg(long, value_name = "SKIN", conflicts_with = "stats")]

@@ -30,7 +30,7 @@ use super::print::{KeyValueTable, to_pretty_json};
 use benches::BenchRunner;
 use folder::ResultFolder;
 
-/// Repeat the paper's experiments, and draw and rate the results
+/// Repeat the experiments of a paper (docs/explanation/paper.md), and rate the results
 ///
 /// Writes to DIR: report.html, each figure as SVG with its data as CSV, results.json with each finding beside the
 /// paper's and its verdict, and the recordings of the benches. Writes nothing if a measurement fails or is interrupted.
@@ -48,7 +48,7 @@ pub(crate) struct ExperimentCommand {
     /// Names of experiments; `all` runs each of them, `list` describes them
     #[arg(value_name = "NAME", required = true)]
     names: Vec<ExperimentArgument>,
-    /// Directory for the results, which is created if necessary
+    /// Directory for the results (required, except for `list`; created if absent)
     #[arg(long, short, value_name = "DIR")]
     output: Option<PathBuf>,
     #[command(flatten)]

@@ -46,20 +46,20 @@ pub(crate) struct ExplainCommand {
     /// or --batch: a skin file or a recording
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
-    /// Explain the torques for the joint broadcast with this epoch, which is its number modulo 256
+    /// Explain the torques for the joint broadcast whose number modulo 256 is this epoch
     #[arg(long, value_name = "E", required_unless_present_any = ["force", "batch"])]
     epoch: Option<u8>,
     /// Take the first joint broadcast of the epoch at or after this time: seconds since the start of the run, or since
     /// the first frame of a log
     #[arg(long, value_name = "S", value_parser = parse_time_ns, default_value = "0", conflicts_with_all = ["force", "batch"])]
     at: u64,
-    /// Take the Kth joint broadcast of the epoch, because epochs repeat after 256 broadcasts
+    /// Take the Kth joint broadcast of the epoch from --at on; epochs repeat every 256 broadcasts
     #[arg(long, value_name = "K", default_value_t = 1, conflicts_with_all = ["force", "batch"], value_parser = clap::value_parser!(u32).range(1..))]
     occurrence: u32,
     /// Show every step of the computation of one cell
     #[arg(long, value_name = "[BUS:]NODE")]
     cell: Option<CellName>,
-    /// Show the torques of all cells on this joint
+    /// Show the torques of all cells, but only at joint J (1 is the first)
     #[arg(long, value_name = "J", conflicts_with_all = ["force", "batch"], value_parser = clap::value_parser!(u8).range(1..=32))]
     joint: Option<u8>,
     #[command(flatten)]

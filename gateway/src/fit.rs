@@ -42,9 +42,9 @@ const FOR_TRAFFIC: &str = "Options for traffic";
   skinbus fit run.log --skin skin.toml --json | jq -c 'select(.end_s and .end_s - .time > 0.016)'
   skinbus fit vcan0 vcan1 --duration 10")]
 pub(crate) struct FitCommand {
-    /// Skin file, of which the worst case is computed; or recorded frames, in a candump log or an MCAP
-    /// recording (all parts of a split one); or live buses. `-` is standard input: a skin if --table, --format or
-    /// --computation is given, else frames
+    /// Skin file, for its load when all cells answer; or recorded frames, in a candump log or an MCAP recording (all
+    /// parts of a split one); or live buses. `-` is standard input: a skin if --table, --format or --computation is
+    /// given, else frames
     #[arg(value_name = "SKIN|FILE|BUS", required = true)]
     sources: Vec<PathBuf>,
     /// Nominal bit rate in bit/s, used for identifiers and for whole classic frames, such as 1000000, 500k or 1M
@@ -59,20 +59,21 @@ pub(crate) struct FitCommand {
     /// Assume this frame format on all buses, instead of the skin's formats
     #[arg(help_heading = FOR_SKIN, long, value_parser = one_of_values(FORMATS))]
     format: Option<Format>,
-    /// Longest time in µs that a cell needs to compute its answer [default: 68.5, as the paper's cell]
+    /// Longest time in µs that a cell needs to compute its answer [default: 68.5, as in the paper of docs/explanation/paper.md]
     #[arg(help_heading = FOR_SKIN, long, value_name = "US", value_parser = parse_computation_ns)]
     computation: Option<u64>,
     /// Assumed bit rates of a bus, such as can0=500k/2M or can1=1M; repeat the option for further buses
     #[arg(help_heading = FOR_TRAFFIC, long, value_name = "BUS=RATES", value_parser = rates_of_bus)]
     rates: Vec<(String, BitRates)>,
-    /// Skin file that gives the bit rates and the worst case of its buses [default: the skin in the recording]
+    /// Skin file, for its bit rates and worst case (all cells answer) [default: the skin in the recording]
     #[arg(help_heading = FOR_TRAFFIC, long, value_name = "SKIN")]
     skin: Option<PathBuf>,
     /// Also count frames that only a test bench sends (stimuli, sync, report, their answers, simulated
     /// wires)
     #[arg(help_heading = FOR_TRAFFIC, long)]
     bench_traffic: bool,
-    /// Meaning of the time stamps of frames [default: request; end if the bus or the recording says so]
+    /// Meaning of the time stamps of frames [default: end on embedded buses whose frames take time and in their
+    /// recordings, else request]
     #[arg(help_heading = FOR_TRAFFIC, long, value_enum, value_name = "MEANING")]
     time_stamps: Option<TimeStamps>,
     /// Assumed bit error rate, 0 to 0.01 [default: 0]; each damaged frame causes an error frame and a
@@ -82,15 +83,15 @@ pub(crate) struct FitCommand {
     /// Random seed for bit errors [default: 1]
     #[arg(help_heading = FOR_TRAFFIC, long, value_name = "N", requires = "ber")]
     seed: Option<u64>,
-    /// Time after which the measurement of live buses ends
+    /// Duration of the measurement on live buses [default: until Ctrl-C]
     #[arg(help_heading = FOR_TRAFFIC, long, value_name = "TIME", value_parser = parse_duration, allow_negative_numbers = true)]
     duration: Option<f64>,
     /// Print JSON instead of tables: one object for a skin, one for each frame of traffic
     ///
     /// Keys of a frame: bus; id, as candump prints it; time, its time stamp; start_s and end_s, its computed start and
     /// end (all in s, on the clock of the capture); nominal_bits and data_bits, including stuff bits and intermission;
-    /// time_is, which is "end" if the time stamp is the end of the frame, and absent otherwise. Of frames that
-    /// are not counted, bits, start_s and end_s are null; of those that could not be sent, start_s and end_s.
+    /// time_is, which is "end" if the time stamp is the end of the frame, and absent otherwise. For frames
+    /// that could not be sent, start_s and end_s are null; for uncounted frames, nominal_bits and data_bits too.
     #[arg(long, short)]
     json: bool,
     #[command(flatten)]
@@ -100,9 +101,9 @@ pub(crate) struct FitCommand {
 /// Meaning of the time stamps of frames.
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum TimeStamps {
-    /// The frame is requested at this time, as on a bus where frames take no time: computes when it would be sent
+    /// Time of the request, as on a bus where frames take no time: computes when each frame would be sent
     Request,
-    /// The frame has ended at this time, as in a capture of a real bus: computes the load, but no queueing
+    /// Time of the frame's end, as in a capture of a real bus: computes the load, but no queueing
     End,
 }
 

@@ -69,7 +69,7 @@ pub(crate) struct ReplayCommand {
     /// Compare the cells' answers with the recorded ones; with --speed max this implies --lockstep
     #[arg(long)]
     expect: bool,
-    /// Accept torques that differ by up to this many steps of 1/4096 Nm, and count them
+    /// Accept torques that differ by up to this many steps (in Q3.12: 1/4096 Nm), and count them
     #[arg(long, value_name = "STEPS", default_value_t = 0, requires = "expect")]
     tolerance: u16,
     /// Start the cells as processes, and end them afterwards

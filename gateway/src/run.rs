@@ -67,7 +67,7 @@ struct CommonOptions {
     /// --duration, the run then ends only with Ctrl-C
     #[arg(long)]
     view: bool,
-    /// Address at which the page is served [default: any free port of this machine]
+    /// Address at which the page is served [default: 127.0.0.1, a free port]
     #[arg(long, value_name = "ADDRESS:PORT", value_parser = parse_address, requires = "view")]
     listen: Option<SocketAddr>,
     #[command(flatten)]
@@ -146,8 +146,7 @@ impl RecordingArguments {
 }
 
 fn demo_bus_kinds_help() -> String {
-    let names = BusKind::names();
-    format!("{names}; auto is SocketCAN if an interface vcan0 exists [default: embedded]")
+    format!("Bus kind: {} (socketcan if vcan0 exists, else embedded) [default: embedded]", BusKind::choices())
 }
 
 /// Run a demonstration: 253 cells on a robot arm, some of them touched
@@ -163,7 +162,7 @@ fn demo_bus_kinds_help() -> String {
 pub(crate) struct DemoCommand {
     #[command(flatten)]
     common: CommonOptions,
-    /// Write the frames to this file [default: skinbus-demo.log, or skinbus-demo-1.log, ... if that exists]
+    /// Candump log of the frames [default: skinbus-demo.log; if it exists, skinbus-demo-1.log, ...]
     #[arg(long, value_name = "FILE")]
     candump: Option<PathBuf>,
     #[command(flatten)]
@@ -214,14 +213,14 @@ pub(crate) struct RunCommand {
     /// Do not start cells, because real or simulated cells are already on the buses
     #[arg(long)]
     no_spawn: bool,
-    /// Keep the parameters of the started cells in files in this directory, as in flash
+    /// Keep the parameters of started cells in this directory for later runs
     #[arg(long, value_name = "DIR")]
     flash: Option<PathBuf>,
-    /// Firmware of a cell (for the micro:bit) that emulated cells run; docs/how-to/firmware.md explains how to build it
+    /// Cell firmware (for the micro:bit) that --emulate runs; docs/how-to/firmware.md explains how to build it
     #[arg(long, value_name = "ELF", requires = "emulate")]
     firmware: Option<PathBuf>,
-    /// Run these cells, given by node id or as BUS:NODE, as firmware in QEMU instead of as processes. They are
-    /// commissioned at the start, keep their flash in files like other cells, and end with the run
+    /// Run these cells (NODE or BUS:NODE) as firmware in QEMU instead of as processes. They are commissioned at the
+    /// start, keep their flash in --flash if given, and end with the run
     #[arg(
         long,
         value_name = "[BUS:]N,...",

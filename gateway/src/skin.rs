@@ -38,7 +38,7 @@ enum SkinSubcommand {
     Urdf(urdf::UrdfCommand),
 }
 
-/// Describe a skin of hexagonal cells on the arm of a UR5
+/// Write a skin file: hexagonal cells on the arm of a UR5
 ///
 /// The text depends only on the options. Its first line is the command that generates it.
 #[derive(Args, Debug)]

@@ -59,7 +59,7 @@ const DEFAULT_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHO
   skinbus view run.log --skin skin.toml
   skinbus view skin.toml --listen 0.0.0.0:8100 --token-file token --read-only")]
 pub(crate) struct ViewCommand {
-    /// Skin file, for all its live buses; names of some of its buses, with --skin; or a candump log or MCAP recording
+    /// Live: a skin file, for all its buses, or names of buses with --skin. Recorded: a candump log or MCAP recording
     /// (all parts of a split one, in any order)
     #[arg(required = true, value_name = "SKIN|BUS|FILE")]
     sources: Vec<PathBuf>,
@@ -76,8 +76,8 @@ pub(crate) struct ViewCommand {
     /// token]
     #[arg(long, value_name = "FILE")]
     token_file: Option<PathBuf>,
-    /// Write the page's address to this file, for scripts; only you can read the file, and it is deleted when the page
-    /// ends; - for standard output
+    /// Write the page's address to this file, for scripts; only you can read the file, and it is deleted when the
+    /// command ends; - for standard output
     #[arg(long, value_name = "FILE")]
     address_file: Option<PathBuf>,
     /// Let web pages only watch: they cannot press cells, halt or resume the robot
@@ -86,8 +86,8 @@ pub(crate) struct ViewCommand {
     /// If a bus does not exist yet, wait for it instead of failing
     #[arg(long)]
     wait: bool,
-    /// Also send to Foxglove and Lichtblick the topics of a recording: those of a live bus as its frames come, or those
-    /// of a file as the page plays it. By Foxglove's WebSocket protocol on this port of this machine; 0: any free port
+    /// Also serve Foxglove and Lichtblick by WebSocket on this port of 127.0.0.1 (0: any free port): the topics that a
+    /// recording has, from a live bus as its frames come, or from a file as the page plays it
     #[arg(long, value_name = "PORT")]
     foxglove: Option<u16>,
     /// Serve the run that started this program: accept connections on the listener at standard input, exchange commands
@@ -103,8 +103,8 @@ pub(crate) struct ViewCommand {
 /// Options of a run's page.
 #[derive(Args, Debug, Default)]
 pub(crate) struct PageOptions {
-    /// Write the page's address to this file, for scripts; only you can read the file, and it is deleted when the page
-    /// ends; - for standard output
+    /// Write the page's address to this file, for scripts; only you can read the file, and it is deleted when the
+    /// command ends; - for standard output
     #[arg(long, value_name = "FILE", requires = "view")]
     address_file: Option<PathBuf>,
     /// Read the secret token of the page's address from this file [default: the variable SKINBUS_TOKEN, else a random

@@ -36,7 +36,7 @@ pub(super) struct TorqueOptions {
     /// Positions of the chain's joints in rad or m, separated by spaces
     #[arg(long, value_name = "POSITIONS", requires = "force", allow_hyphen_values = true)]
     joints: Option<String>,
-    /// Compute the torques for each row of a CSV file
+    /// Compute the torques for each row of a CSV file with the columns cell, force_n and q
     #[arg(long, value_name = "ROWS.csv", conflicts_with_all = ["force", "cell", "epoch", "skin"])]
     batch: Option<PathBuf>,
 }

@@ -28,7 +28,7 @@ pub(super) struct SensingCommand {
     /// When cells send their sensor values
     #[arg(value_parser = one_of_values(MODES))]
     mode: SensingMode,
-    /// Rate in continuous mode, in frames per second and cell
+    /// Rate in continuous mode: sensor frames per second of each cell
     #[arg(value_name = "HZ", allow_negative_numbers = true)]
     hz: Option<f64>,
     /// Cell that receives the packet; `everyone` for all cells

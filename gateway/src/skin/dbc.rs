@@ -12,7 +12,7 @@ use crate::input::read_skin_or_recording;
 use crate::output::{OverwriteOption, check_distinct_files};
 use crate::print::comma_separated;
 
-/// Describe a bus in a DBC file, for cantools, SavvyCAN and others
+/// Write a DBC file for a bus of a skin, for cantools, SavvyCAN and others
 ///
 /// Each identifier of the bus becomes a message: the commands, and all packets from and to each cell of the skin. Each
 /// field becomes a signal with its scale, unit and range; byte 13 multiplexes pages and parameters. Identifiers repeat

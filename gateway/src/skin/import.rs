@@ -14,7 +14,7 @@ use super::super::print::{comma_separated, count_with_noun};
 use super::super::robot_file::{read_urdf, relative_path};
 use super::covering::{self, CoverArguments, CoverResult};
 
-/// Describe a skin on your own robot, from its URDF
+/// Write a skin file for your robot, from its URDF
 ///
 /// A chain of joints leads from the root to each tip. Its joints become Denavit-Hartenberg rows. Computes and prints
 /// the difference between these and the URDF's own kinematics: more than 1e-9 m or rad is an error. Chains may share

@@ -9,7 +9,7 @@ use robots::write_urdf;
 
 use super::super::output::{OverwriteOption, check_distinct_files};
 
-/// Describe a skin's robot as a URDF: its chains, row by row
+/// Write a skin's robot as a URDF: a joint for each row of its chains
 ///
 /// Recordings carry this URDF on /robot_description for a skin without robot.urdf. Each row becomes a joint with its
 /// origin, its axis and the limits of the skin; fixed rows become fixed joints, and a link `tip` follows the last row.
@@ -18,7 +18,7 @@ use super::super::output::{OverwriteOption, check_distinct_files};
 #[derive(Args, Debug)]
 #[command(after_help = "Example:\n  skinbus skin urdf skin.toml -o robot.urdf")]
 pub(super) struct UrdfCommand {
-    /// Skin file (TOML) whose robot is described
+    /// Skin file (TOML) whose robot is written
     #[arg(value_name = "SKIN")]
     file: PathBuf,
     /// Output file; after an error, no incomplete file is left [default: standard output]

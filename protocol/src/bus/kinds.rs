@@ -41,14 +41,17 @@ impl BusKind {
         format!("{} or {last}", first.join(", "))
     }
 
+    /// Returns the values of an option for the kind as text: `socketcan, embedded or auto`.
+    #[must_use]
+    pub fn choices() -> String {
+        format!("{} or auto", Self::ALL.map(Self::name).join(", "))
+    }
+
     /// Returns the help of an option for the kind of one bus.
     #[must_use]
     pub fn help() -> String {
-        let names = Self::names();
-        format!(
-            "Bus kind: {names}; auto uses SocketCAN if an interface of this name exists, else the embedded \
-             bus"
-        )
+        let choices = Self::choices();
+        format!("Bus kind: {choices} (socketcan if the bus has an interface of its name, else embedded)")
     }
 
     /// Returns true for network interfaces of the kernel; buses of all other kinds are sockets that a process

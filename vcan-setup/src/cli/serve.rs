@@ -49,7 +49,7 @@ pub(crate) struct ServeBusOptions {
     /// Let frames that only a bench sends take time, too: stimuli, sync and report with their answers, simulated wires
     #[arg(long, requires = "rates")]
     bench_traffic: bool,
-    /// Write all requests and transmissions to this new file, a line each
+    /// Write a line for each queued and each sent frame to this new file
     #[arg(long, value_name = "FILE", requires = "rates")]
     record: Option<PathBuf>,
 }

@@ -49,7 +49,7 @@ pub(crate) struct SlcanOptions {
     /// The adapters support classic CAN only: FD frames from the bus are dropped
     #[arg(long)]
     classic: bool,
-    /// Seconds to wait after opening a line, for boards that are reset by it (Arduino, ESP32)
+    /// Seconds to wait after opening a line, for boards that it resets (Arduino, ESP32) [default: 0]
     #[arg(long, value_name = "SECONDS", value_parser = parse_settle)]
     settle: Option<Duration>,
     /// Start even if lines cannot be opened yet, and open them when they appear

@@ -21,7 +21,7 @@ use super::{query_interfaces, targets_from_arguments, to_json};
 /// The time within which a link must answer.
 const ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
 
-/// Show the CAN interfaces of this machine, and the embedded buses, which this user serves without a kernel interface
+/// Show the CAN interfaces of this machine, and this user's embedded buses (without a kernel interface)
 ///
 /// Shows the bit rates and the error state of hardware too. Exit code 1 if a named bus does not exist.
 #[derive(Args, Debug)]

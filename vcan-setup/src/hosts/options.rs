@@ -29,7 +29,7 @@ pub struct LinkOptions {
     /// Connect to the link on another host: tcp/HOST:PORT or tls/HOST:PORT; repeat the option for further hosts
     #[arg(long, value_name = "ENDPOINT")]
     pub connect: Vec<String>,
-    /// Accept connections from other hosts at this address of this host
+    /// Accept connections from other hosts at this address of this host: tcp/HOST:PORT or tls/HOST:PORT
     #[arg(long, value_name = "ENDPOINT")]
     pub listen: Vec<String>,
     /// Name under which other hosts see this host [default: the name of the machine]
