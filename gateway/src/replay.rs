@@ -236,7 +236,7 @@ fn table(summary: &Summary, is_coloured: bool) -> String {
         rows.add_row(
             "frames sent",
             format_quantiles(late),
-            format!("idle machine: {}", format_quantiles(idle)),
+            format!("before the replay: {}", format_quantiles(idle)),
         );
     }
     if summary.buses.len() > 1 || summary.buses.iter().any(|bus| bus.capture != bus.name) {

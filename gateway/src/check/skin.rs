@@ -99,8 +99,8 @@ fn describe(skin: &Skin) -> String {
         let roots: Vec<_> = skin.cells_on_bus(index).filter(|cell| cell.root).map(|cell| cell.node).collect();
         let roots = match roots.as_slice() {
             [] => "no root".to_owned(),
-            [root] => format!("root {root}"),
-            roots => format!("roots {}", space_separated(roots)),
+            [root] => format!("root: cell {root}"),
+            roots => format!("roots: cells {}", space_separated(roots)),
         };
         let rates = bus.bitrate.map(|nominal| match bus.data_bitrate {
             Some(data) => format!(", {nominal} and {data} bit/s"),
@@ -126,7 +126,7 @@ fn describe(skin: &Skin) -> String {
         text += &format!("note: cells {} and {} have the same position\n", name(first), name(second));
     }
     text + &format!(
-        "hash: {:04X} of the parameters of all cells; --list shows the hash of each cell\n",
+        "hash of the parameters of all cells: {:04X}; --list shows that of each cell\n",
         hash(skin)
     )
 }

@@ -135,8 +135,8 @@ impl ComparisonText<'_> {
             format_decimals(source.reply_us.as_ref().map(of), 0, "-")
         };
         let information = || "not compared".to_owned();
-        row("reply, 50 %, µs", at(|it| it.p50, a), at(|it| it.p50, b), information());
-        row("reply, 99 %, µs", at(|it| it.p99, a), at(|it| it.p99, b), information());
+        row("reply time, 50 %, µs", at(|it| it.p50, a), at(|it| it.p50, b), information());
+        row("reply time, 99 %, µs", at(|it| it.p99, a), at(|it| it.p99, b), information());
         for (name, of) in [
             ("late replies", (|it| it.late) as fn(&CaptureFigures) -> u64),
             ("lost packets", |it| it.lost),

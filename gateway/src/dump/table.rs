@@ -24,7 +24,7 @@ pub(super) fn report_text(
     let head = format!("{what}, {:.3} s", report.duration_s);
     let mut rows = KeyValueTable::new(name, head, print::count_with_noun(report.frames, "frame"));
     rows.add_row_unless_zero("frames out of order", report.times_backwards, "earlier than the frame before");
-    rows.add_row_unless_zero("frames missing", report.dropped, "lost by the recorder");
+    rows.add_row_unless_zero("not recorded", report.dropped, "lost by the recorder");
     rows.add_row_unless_zero(
         "frames of other buses",
         report.frames_of_other_buses,
@@ -49,14 +49,17 @@ pub(super) fn report_text(
     text
 }
 
-/// A rate with the time span that it covers.
-fn rate_text(rate: Option<f64>, span_s: f64) -> String {
-    or_else_text(rate.map(|rate| format!("{rate:.1} per s over {} s", seconds_text(span_s))), "")
+/// Shortest time span in s over which a rate is shown.
+const MIN_RATE_SPAN_S: f64 = 1e-3;
+
+/// Returns a rate if its time span is long enough.
+fn shown_rate(rate: Option<f64>, span_s: f64) -> Option<f64> {
+    rate.filter(|_| span_s >= MIN_RATE_SPAN_S)
 }
 
-/// Formats seconds with enough digits to differ from zero.
-fn seconds_text(span_s: f64) -> String {
-    if span_s < 1e-3 { format!("{span_s:.9}") } else { format!("{span_s:.3}") }
+/// A rate with the time span that it covers.
+fn rate_text(rate: Option<f64>, span_s: f64) -> String {
+    or_else_text(shown_rate(rate, span_s).map(|rate| format!("{rate:.1} per s over {span_s:.3} s")), "")
 }
 
 fn bus_rows(rows: &mut KeyValueTable, bus: &BusReport, duration_s: f64) {
@@ -74,15 +77,13 @@ fn bus_rows(rows: &mut KeyValueTable, bus: &BusReport, duration_s: f64) {
         let odd = comma_separated(odd.map(|(count, what)| format!("{count} {what}")));
         rows.add_row("epochs", format!("{first} to {last}"), odd);
     }
-    rows.add_row_unless_zero(
-        "simulated wires",
-        bus.wires,
-        format!("{}; a real bus has none", rate_text(bus.wires_per_s, bus.wires_span_s)),
-    );
+    let rate = Some(rate_text(bus.wires_per_s, bus.wires_span_s)).filter(|rate| !rate.is_empty());
+    let rate = or_else_text(rate.map(|rate| format!("{rate}; ")), "");
+    rows.add_row_unless_zero("simulated wires", bus.wires, format!("{rate}a real bus has none"));
     let refused: Vec<_> =
         bus.refused.counts_by_reason().into_iter().filter(|(_, count)| *count > 0).collect();
     let reasons = comma_separated(refused.iter().map(|(reason, count)| format!("{count} {reason}")));
-    rows.add_row("damaged or refused", refused.iter().map(|(_, count)| count).sum::<u64>(), reasons);
+    rows.add_row("damaged or invalid", refused.iter().map(|(_, count)| count).sum::<u64>(), reasons);
     let ForeignFrames { standard, extended, remote, error, packets_by_chance, .. } = bus.foreign;
     rows.add_row("foreign", bus.foreign.frames, "");
     rows.add_row_unless_zero("  11-bit identifiers", standard, "");
@@ -94,7 +95,7 @@ fn bus_rows(rows: &mut KeyValueTable, bus: &BusReport, duration_s: f64) {
         rows.add_row("  valid CRC by chance", chance, "expected number");
     }
     let why = if bus.dropped > 0 { "lost by the recorder" } else { "" };
-    rows.add_row("frames missing", bus.dropped, why);
+    rows.add_row("not recorded", bus.dropped, why);
 }
 
 /// Adds rows on the contents of an MCAP recording other than frames.
@@ -141,8 +142,9 @@ fn foreign_identifier_table(bus: &BusReport) -> Table {
             FrameType::Error => "error".to_owned(),
         };
         let first = format!("{:.3}", id.first_s);
-        let in_s = if id.frames > 1 { seconds_text(id.last_s - id.first_s) } else { String::new() };
-        let per_s = format_decimals(id.frames_per_s, 1, "");
+        let span_s = id.last_s - id.first_s;
+        let rate = shown_rate(id.frames_per_s, span_s);
+        let (per_s, in_s) = (format_decimals(rate, 1, ""), format_decimals(rate.map(|_| span_s), 3, ""));
         vec![id.id.clone(), id.frames.to_string(), per_s, in_s, first, bytes, what]
     };
     let ForeignFrames { identifiers, frames_of_other_identifiers: unknown, .. } = &bus.foreign;
@@ -171,8 +173,13 @@ fn cell_table(bus: &BusReport) -> Table {
     let columns: [Column<'_>; 17] = [
         (&name, |cell| Some(cell.node.to_string())),
         ("torques", |cell| Some(cell.torques.to_string())),
-        ("per s", |cell| cell.torques_per_s.map(|rate| format!("{rate:.1}"))),
-        ("over s", |cell| cell.torques_per_s.map(|_| seconds_text(cell.torques_span_s))),
+        ("per s", |cell| {
+            shown_rate(cell.torques_per_s, cell.torques_span_s).map(|rate| format!("{rate:.1}"))
+        }),
+        ("over s", |cell| {
+            let span_s = cell.torques_span_s;
+            shown_rate(cell.torques_per_s, span_s).map(|_| format!("{span_s:.3}"))
+        }),
         ("epochs", |cell| Some(format!("{}..{}", cell.first_epoch?, cell.last_epoch?))),
         ("unanswered", |cell| blank_if_zero(cell.unanswered)),
         ("repeated", |cell| blank_if_zero(cell.repeated)),

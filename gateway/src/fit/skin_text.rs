@@ -51,12 +51,12 @@ pub(super) fn table(skin: &Skin, rows: &[RatesRow]) -> String {
         ),
     };
     format!(
-        "{}: {bus}, a joints message every {} ms, each cell computes for {} µs\n{table}\nload    bus load in the \
-         worst case, when all cells answer: joints messages, {}, heartbeats{}\nlast    longest time from the scheduled joints message \
-         to the end of the last answer\ncells   number of cells that a bus can serve in time; transceivers \
-         can drive about {}\nbuses   number of buses that {cells} cells need, and the limit that determines \
-         it: time or nodes\nroots   load and last if cells send sums and only the tree's roots are on this \
-         bus; with all cells on it, sums save no frames\n",
+        "{}: {bus}, a joints message every {} ms, each cell computes for {} µs\n{table}\npacket  time of the longest packet \
+         on the bus\nload    bus load in the worst case, when all cells answer: joints messages, {}, heartbeats{}\nlast    \
+         longest time from the scheduled joints message to the end of the last answer\ncells   cells that a bus can \
+         serve in time; but transceivers can drive only about {}\nbuses   buses that {cells} cells need and, if \
+         several, the limit behind this: time or nodes\nroots   load and last if cells send sums and only the roots \
+         are on this bus; if all cells are on it, sums save no frames\n",
         printable(&skin.name),
         format_millis(case.period_ns),
         format_micros(case.computation_ns),

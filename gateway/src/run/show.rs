@@ -123,11 +123,11 @@ fn add_accuracy_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bo
     }
     let name = |short: &'static str, long: &'static str| if is_verbose { long } else { short };
     let of_paper =
-        |errors: &TorqueErrors, paper: f64| format!("{}, paper {paper}", format_torque_count(errors));
+        |errors: &TorqueErrors, paper: f64| format!("{}, paper: mean {paper}", format_torque_count(errors));
     if single {
         let errors = &accuracy.single;
         rows.add_row(
-            name("each cell", "each cell, joints it loads"),
+            name("each cell", "each cell, joints that move it"),
             format_mean_and_max(errors),
             of_paper(errors, paper::SINGLE_CELL_ERROR_NM),
         );
@@ -151,7 +151,7 @@ fn add_accuracy_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bo
     if sums {
         let errors = &accuracy.sums;
         rows.add_row(
-            name("sums", "sums, joints they load"),
+            name("sums", "sums, joints that move cells"),
             format_mean_and_max(errors),
             of_paper(errors, paper::SUMMED_ERROR_NM),
         );
@@ -185,7 +185,7 @@ fn add_control_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: boo
     rows.add_row(
         "tick lateness",
         format_quantiles(&control.late_us),
-        format!("idle machine: {}", format_quantiles(&control.idle_late_us)),
+        format!("before the run: {}", format_quantiles(&control.idle_late_us)),
     );
     if is_verbose && control.central_us.count > 0 {
         rows.add_row("tick duration", format_quantiles(&control.took_us), "");
@@ -216,14 +216,15 @@ fn add_control_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: boo
     }
     if is_verbose {
         let granted = |granted| if granted { "granted" } else { "refused" };
-        let locked = granted(control.memory_locked);
-        rows.add_row("SCHED_FIFO", granted(control.fifo), format!("memory lock {locked}"));
+        let lock = format!("memory lock {}", granted(control.memory_locked));
+        rows.add_row("SCHED_FIFO", granted(control.fifo), lock);
     }
 }
 
 fn add_reply_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     let replies = &bus.replies;
-    rows.add_section(&bus.name, frames::cells_by_status(&bus.cells), format!("at the end; {} bus", bus.kind));
+    let what = format!("cells at the end; {} bus", bus.kind);
+    rows.add_section(&bus.name, frames::cells_by_status(&bus.cells), what);
     if bus.outages.times > 0 {
         let end = if bus.outages.at_end { ", also at the end" } else { "" };
         let ticks = format!("{} ran without this bus", count_with_noun(bus.outages.ticks, "tick"));
@@ -469,7 +470,7 @@ fn add_cost_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) 
             rows.add_row("private memory of a cell process", format!("{kib} KiB"), "of the largest one");
         }
         if let Some(kib) = summary.memory.gateway_private_kib {
-            let buses = summary.memory.buses_private_kib.map(|kib| format!("{kib} KiB in bus servers"));
+            let buses = summary.memory.buses_private_kib.map(|kib| format!("bus servers: {kib} KiB"));
             rows.add_row("private memory of the gateway", format!("{kib} KiB"), buses.unwrap_or_default());
         }
         rows.add_row("start to first broadcast", format!("{:.2} s", summary.first_broadcast_s), "");

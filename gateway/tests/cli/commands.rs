@@ -314,13 +314,13 @@ fn a_generated_skin_is_a_whole_file_and_checked_in_a_few_lines() {
     assert_eq!(refusal(&format!("{generate} {nowhere}"), 2), format!("skinbus: {nowhere}: {why}"));
 
     let shown = output(gateway(&format!("check {}", file.display())));
-    let (hash, lines): (Vec<_>, Vec<_>) = shown.lines().partition(|line| line.starts_with("hash: "));
+    let (hash, lines): (Vec<_>, Vec<_>) = shown.lines().partition(|line| line.starts_with("hash of "));
     let expected = [
         "ur5-3: 3 cells, 2 buses",
         "robot: UR5, 6 joints",
         "timing: control loop 500 Hz, joints 62.5 Hz (every 16000 us), kinesthetic controller",
-        "bus vcan0 (fd, sum in slots of 6000 us): 2 cells: 2 on joint 2; root 1",
-        "bus vcan1 (fd, sum in slots of 12000 us): 1 cell: 1 on joint 3; root 1",
+        "bus vcan0 (fd, sum in slots of 6000 us): 2 cells: 2 on joint 2; root: cell 1",
+        "bus vcan1 (fd, sum in slots of 12000 us): 1 cell: 1 on joint 3; root: cell 1",
     ];
     assert_eq!((hash.len(), lines), (1, expected.to_vec()));
 

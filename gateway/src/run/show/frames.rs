@@ -79,10 +79,10 @@ pub(super) fn last_reply_remark(bus: &BusSummary, untimed: &str) -> String {
     }
 }
 
-/// Adds a row on the age of joints that cells have not received.
+/// Adds a row on the age of joints that cells have not yet processed.
 pub(super) fn add_joint_age_row(rows: &mut KeyValueTable, bus: &BusSummary) {
-    let why = "a large age: this machine was busy, or frames were lost";
-    rows.add_row("age of joints that cells missed, µs", format_quantiles(&bus.joints_not_taken_us), why);
+    let why = "at each heartbeat; large: machine busy, or frames lost";
+    rows.add_row("age of joints not yet processed, µs", format_quantiles(&bus.joints_not_taken_us), why);
 }
 
 /// Adds rows on the packets from the cells, by what became of them.
