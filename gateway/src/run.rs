@@ -443,7 +443,7 @@ fn run_bench(
             return controlled::end_channel(channel, None, Err(failure));
         }
         Err(panic) => {
-            (Summary::for_failed_start(&options.skin, "the gateway panicked".to_owned()), Some(panic))
+            (Summary::for_failed_start(&options.skin, "the gateway crashed".to_owned()), Some(panic))
         }
     };
     add_reply_bounds(&mut ended, &options.skin);
@@ -453,7 +453,7 @@ fn run_bench(
             .err()
     });
     if let Some(panic) = panicked {
-        let failure = Failure::run_error("the gateway panicked");
+        let failure = Failure::run_error("the gateway crashed");
         let _ = controlled::end_channel(channel, Some(&ended), Err(failure));
         panic::resume_unwind(panic);
     }

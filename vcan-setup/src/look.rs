@@ -88,7 +88,7 @@ fn observe_all_buses(
         let begun: Vec<_> = buses.iter().map(begin).collect();
         let end = |thread: io::Result<ScopedJoinHandle<'_, _>>| match thread.map(ScopedJoinHandle::join) {
             Ok(Ok(heard)) => heard,
-            Ok(Err(_)) => Err("the thread that listened on the bus panicked".to_owned()),
+            Ok(Err(_)) => Err("the thread that listened on the bus crashed".to_owned()),
             Err(error) => Err(format!("cannot start a thread: {error}")),
         };
         begun.into_iter().map(|thread| thread.map(end)).collect()

@@ -61,7 +61,7 @@ impl Netlink {
         };
         thread::scope(|scope| thread::Builder::new().spawn_scoped(scope, enter).map(ScopedJoinHandle::join))?
             .unwrap_or_else(|_| {
-                Err(io::Error::other("the thread that entered the network namespace panicked"))
+                Err(io::Error::other("the thread that entered the network namespace crashed"))
             })
     }
 

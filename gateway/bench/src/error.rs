@@ -153,10 +153,10 @@ pub enum RunError {
     #[error("these cells did not switch to sums (parameter 6): {0}; install firmware that supports sums")]
     NoSums(String),
     /// A thread panicked.
-    #[error("the {0} panicked")]
+    #[error("the {0} crashed (a bug): please report it")]
     Panicked(&'static str),
     /// A receiver ended.
-    #[error("a receiver thread ended while the control loop was running")]
+    #[error("a receiver thread crashed (a bug): please report it")]
     ReceiverEnded,
 }
 

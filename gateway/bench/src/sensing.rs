@@ -66,7 +66,7 @@ pub enum SensingError {
         reason: i16,
     },
     /// Some cells are present but did not answer.
-    #[error("{cells} on {bus} did not answer, but {done} did: repeat the command when the others send again")]
+    #[error("{cells} on {bus} did not answer ({done} did): repeat the command when all cells send")]
     Silent {
         /// The cells as text.
         cells: String,
@@ -196,7 +196,7 @@ mod tests {
         }
         assert!(!have_all_cells_answered(&answers, None, true));
         assert_eq!(answers.missing_cells(), [cell(3)].into(), "the answer to another sender does not count");
-        let why = "cell 3 on vcan0 did not answer, but 2 did: repeat the command when the others send again";
+        let why = "cell 3 on vcan0 did not answer (2 did): repeat the command when all cells send";
         assert_eq!(says(&answers, None), Err(why.to_owned()));
         answers.record_message(&confirms(3, SENSING_REQUEST_TAG));
         assert!(

@@ -191,9 +191,7 @@ pub enum CoverError {
     #[error("{0} nodes per bus: the number must be 1 to {MAX_CELLS_PER_BUS}")]
     Nodes(usize),
     /// There are more links than [`MAX_LINKS`].
-    #[error(
-        "{0} links are too many, the maximum is {MAX_LINKS}: name links far from the skin in --leave-out"
-    )]
+    #[error("{0} links are too many (at most {MAX_LINKS}): use --leave-out for links far from the skin")]
     Links(usize),
     /// A keep-out box has no link or invalid sides.
     #[error("keep-out box {index}: {reason}; correct it")]

@@ -116,7 +116,7 @@ pub enum ImportError {
         bus: String,
     },
     /// Two cells on one bus have the same node id.
-    #[error("{}node {node} of bus {bus:?} is already used in line {first}: give this cell another node id, or none", line_prefix(*line))]
+    #[error("{}node {node} of bus {bus:?} is already used in line {first}: give this cell another node id, or leave it empty", line_prefix(*line))]
     Taken {
         /// The line of the file of cells.
         line: usize,

@@ -237,7 +237,7 @@ pub enum RobotProblem {
     },
     /// A length of a row exceeds the range of a cell's parameters.
     #[error(
-        "row {row}, to {to}: {what} = {value:.3} m; it must be in [-{MAX_LENGTH_M}, {MAX_LENGTH_M}) m: {hint}"
+        "row {row}, to {to}: {what} = {value:.3} m; allowed: [-{MAX_LENGTH_M}, {MAX_LENGTH_M}) m; {hint}"
     )]
     Length {
         /// Number of the row, from 1.

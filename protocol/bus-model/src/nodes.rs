@@ -49,9 +49,7 @@ impl Default for TransmitQueue {
 
 /// The error for a text that does not describe a transmit queue.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
-#[error(
-    "{0:?} is not a transmit queue: use fifo or priority, or with a depth from 1 to 65536, such as fifo:10"
-)]
+#[error("{0:?} is not a transmit queue: use fifo or priority, or add a depth of 1 to 65536, such as fifo:10")]
 pub struct TransmitQueueError(String);
 
 impl FromStr for TransmitQueue {

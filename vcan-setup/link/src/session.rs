@@ -68,7 +68,7 @@ pub(crate) enum LinkError {
     Name(String, String),
     /// Another process of this machine already links the bus.
     #[error(
-        "the bus '{0}' is already linked by another process on this host: one link serves all other hosts"
+        "the bus '{0}' is already linked by a process on this host: use it for all hosts, or stop it"
     )]
     Twice(String),
     /// The system call that waits for frames failed.

@@ -131,7 +131,7 @@ pub enum PlanRefusal {
     },
     /// The hardware is set to classic CAN, but the skin requires CAN FD.
     #[error(
-        "{name} is {what} with MTU {mtu}, but {file} has format = \"fd\", which needs {FD_MTU}: `sudo vcan-setup up {file} --set-bit-rates` switches it to CAN FD if it can, or use \"classic\""
+        "{name} is {what} with MTU {mtu}, but {file} has format = \"fd\", which needs {FD_MTU}: `sudo vcan-setup up {file} --set-bit-rates` tries CAN FD on it, or set format = \"classic\""
     )]
     HardwareNarrow {
         /// The name of the interface.

@@ -129,7 +129,7 @@ fn hardware_of_a_skin_is_compared_and_left_as_it_is() {
     assert_eq!(
         refused(&open, &other),
         "can0 is CAN hardware (kvaser_pci) with MTU 16, but skin.toml has format = \"fd\", which needs 72: \
-         `sudo vcan-setup up skin.toml --set-bit-rates` switches it to CAN FD if it can, or use \"classic\""
+         `sudo vcan-setup up skin.toml --set-bit-rates` tries CAN FD on it, or set format = \"classic\""
     );
     let classic = CanHardware { fd: false, ..kvaser(Some(1_000_000), Some(5_000_000)) };
     assert!(

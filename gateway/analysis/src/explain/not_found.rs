@@ -18,7 +18,7 @@ pub enum JointsNotFound {
     },
     /// The capture has no joints on the skin's buses.
     #[error(
-        "the capture contains no joints message on {buses}, and cells send torques only as answers to these"
+        "the capture contains no joints message on {buses}: record while a gateway runs the control loop"
     )]
     Joints {
         /// Names of the skin's buses that are in the capture.

@@ -209,7 +209,7 @@ fn what_is_not_there_is_named_with_what_is() {
     assert_eq!(error, expected);
     let error = explained(&skin, &[heartbeat(0)], first(5)).unwrap_err().to_string();
     let expected =
-        "the capture contains no joints message on vcan0, and cells send torques only as answers to these";
+        "the capture contains no joints message on vcan0: record while a gateway runs the control loop";
     assert_eq!(error, expected);
     let mut watch = JointsWatcher::new(&skin, first(5));
     watch.receive(0, "can7", None);

@@ -79,7 +79,7 @@ pub enum LaunchError {
     },
     /// An embedded bus is not served.
     #[error(
-        "the program {path} was started to serve the bus {bus}, but did not report that it does; see its messages above"
+        "the program {path} was started to serve the bus {bus}, but did not report success; see its messages above"
     )]
     Serve {
         /// Path of the serving program.
@@ -91,7 +91,7 @@ pub enum LaunchError {
 
 /// The error of a system that grants no file in memory.
 #[derive(Debug, Error)]
-#[error("cannot create a file in memory: {0}")]
+#[error("cannot create the skin file for cells in memory: {0}")]
 pub struct MemoryFileError(#[source] std::io::Error);
 
 /// Raises the limit of open files for this process and all processes that it starts, so that a gateway can use `buses`

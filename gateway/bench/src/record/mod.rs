@@ -210,7 +210,7 @@ impl Recorder {
         self.stop.now.store(true, Ordering::Release);
         let mut recording = self.thread.join().unwrap_or_else(|_| {
             let errors =
-                vec!["the recorder panicked: the next run recovers the part that was written".to_owned()];
+                vec!["the recorder crashed: the next run recovers the part that was written".to_owned()];
             RecordingAccount { errors, ..RecordingAccount::default() }
         });
         recording.lost_queue = unrecorded.frames;

@@ -99,7 +99,7 @@ pub enum ReplayError {
     #[error("{0}")]
     Line(String),
     /// The capture has too many buses.
-    #[error("{0} has frames of more than {MAX_BUSES} buses, which is the maximum for a replay")]
+    #[error("{0} has frames of too many buses: the maximum for a replay is {MAX_BUSES}")]
     Buses(String),
     /// The capture has nothing to send.
     #[error("{0} contains no frames")]

@@ -99,11 +99,11 @@ pub(super) enum CommandError {
     Phase(Phase),
     #[error("the skin has no wire between these cells")]
     NoWire,
-    #[error("the cells of this bus send torques, not sums, so they do not use links")]
+    #[error("the cells of this bus send torques, not sums, so they use no wires")]
     NoLinks,
     #[error("the bus is already down")]
     AlreadyDown,
-    #[error("only a bus that a command took down can be brought up")]
+    #[error("no command of this run has taken this bus down")]
     NotTakenDown,
     #[error("the bus was already brought up, but does not work yet")]
     ComesUp,

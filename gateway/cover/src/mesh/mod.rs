@@ -126,7 +126,7 @@ pub enum MeshError {
         value: f64,
     },
     /// The file has more bytes, triangles or other items than allowed.
-    #[error("mesh {file}: {count} {what} are too many, the maximum is {most}; decimate the mesh")]
+    #[error("mesh {file}: {count} {what} are too many (at most {most}); decimate the mesh")]
     TooLarge {
         /// The file.
         file: String,

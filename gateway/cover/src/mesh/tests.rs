@@ -228,7 +228,7 @@ fn what_is_no_mesh_is_refused_in_one_line() {
     assert!(nan.contains("triangle 1 has the coordinate NaN, which is not finite"), "{nan}");
     let many = vec![[Point3::origin(); 3]; MAX_TRIANGLES + 1];
     let many = message(Mesh::new("many", many));
-    assert_eq!(many, "mesh many: 1000001 triangles are too many, the maximum is 1000000; decimate the mesh");
+    assert_eq!(many, "mesh many: 1000001 triangles are too many (at most 1000000); decimate the mesh");
 }
 
 #[test]

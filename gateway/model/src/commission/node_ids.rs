@@ -12,7 +12,9 @@ use thiserror::Error;
 #[non_exhaustive]
 pub enum NodeIdsError {
     /// Cells of a bus did not send a heartbeat.
-    #[error("{missing} of the {cells} cells on {bus} sent no heartbeat, so their node ids are unknown")]
+    #[error(
+        "{missing} of the {cells} cells on {bus} sent no heartbeat, so their node ids are unknown: start them"
+    )]
     Missing {
         /// Name of the bus.
         bus: String,
@@ -22,7 +24,7 @@ pub enum NodeIdsError {
         cells: usize,
     },
     /// The text does not describe the skin that was read.
-    #[error("the text of the skin file does not match the skin that was read: {0}")]
+    #[error("cannot write node ids into the text of the skin file: {0}")]
     Text(String),
 }
 
@@ -160,6 +162,9 @@ neighbors = [2, 0, 0, 0]
         let skin = Skin::parse("skin.toml", &text).unwrap();
         let node_ids = NodeIds::from([(7, Some(cell(2))), (2, None), (9, Some(cell(3)))]);
         let said = renumber_nodes(&skin, &text, &node_ids).unwrap_err().to_string();
-        assert_eq!(said, "1 of the 3 cells on vcan0 sent no heartbeat, so their node ids are unknown");
+        assert_eq!(
+            said,
+            "1 of the 3 cells on vcan0 sent no heartbeat, so their node ids are unknown: start them"
+        );
     }
 }

@@ -124,7 +124,7 @@ pub enum FailureReason {
         got: [i16; WORDS],
     },
     /// The hash in the heartbeats of the cell does not match the parameters that it reads back.
-    #[error("sends the configuration hash {got:04X} in its heartbeats instead of {target:04X}")]
+    #[error("has configuration hash {got:04X} in its heartbeats, not {target:04X}")]
     Hash {
         /// The hash of the skin's configuration for the cell.
         target: u16,
@@ -132,9 +132,7 @@ pub enum FailureReason {
         got: u16,
     },
     /// The commissioning ended before this cell was done.
-    #[error(
-        "was not finished before commissioning ended; it has either its complete old or its complete new configuration"
-    )]
+    #[error("was not finished before commissioning ended; its configuration is either all old or all new")]
     Stopped,
 }
 

@@ -144,9 +144,13 @@ pub enum Difference {
     Circle(Vec<CellId>),
     /// Cells without a route to a root.
     #[error(
-        "{} {} no route to the gateway: their torques are missing from all sums; check their wires",
+        "{} {}; check the wires",
         cell_list(.0),
-        if .0.len() == 1 { "has" } else { "have" }
+        if .0.len() == 1 {
+            "has no route to the gateway, so no sum contains its torques"
+        } else {
+            "have no route to the gateway, so no sum contains their torques"
+        }
     )]
     Unreachable(Vec<CellId>),
 }

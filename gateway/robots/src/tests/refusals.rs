@@ -206,14 +206,14 @@ fn chains_that_are_too_long() {
         |x: f64| robot(&[TestJoint::hinge([0.0; 3], [0.0; 3]), TestJoint::hinge([x, 0.0, 0.0], [0.0; 3])]);
     assert_eq!(
         chain(&long(2.5), "l2"),
-        "t.urdf: row 1, to joint \"j2\": a = 2.500 m; it must be in [-2, 2) m: choose a tip nearer to the root"
+        "t.urdf: row 1, to joint \"j2\": a = 2.500 m; allowed: [-2, 2) m; choose a tip nearer to the root"
     );
     assert_eq!(good(&long(1.99), "l2").rows.len(), 2);
     let slide =
         |upper: f64| robot(&[TestJoint { limits: [0.0, upper], ..TestJoint::slide([0.0; 3], [0.0; 3]) }]);
     assert_eq!(
         chain(&slide(2.25), "l1"),
-        "t.urdf: row 1, to link \"l1\": d with the joint at its limit = 2.250 m; it must be in [-2, 2) m: choose a root behind that joint, or narrow its limits"
+        "t.urdf: row 1, to link \"l1\": d with the joint at its limit = 2.250 m; allowed: [-2, 2) m; choose a root behind that joint, or narrow its limits"
     );
     assert_eq!(good(&slide(1.75), "l1").rows.len(), 1);
     let reaching = |x: f64| {

@@ -109,7 +109,7 @@ pub enum FormatError {
         leftover: u64,
     },
     /// The names of topics and types take too much memory.
-    #[error("the names of its topics and types are too long: the limit is {limit} bytes")]
+    #[error("the names of its topics and types have more than {limit} bytes, the limit")]
     Names {
         /// The limit in bytes.
         limit: usize,
@@ -132,9 +132,7 @@ pub enum FormatError {
     #[error("a record has the unknown operation code {0:02x}")]
     Unknown(u8),
     /// The operation code does not fit the place of the record in the file, or its contents.
-    #[error(
-        "a record of operation code {0:02x} is in the wrong place, or its contents are not those of this code"
-    )]
+    #[error("a record of operation code {0:02x} is in the wrong place, or has contents of another kind")]
     Code(u8),
     /// The length field of a record contradicts the length of its contents.
     #[error(
@@ -149,7 +147,7 @@ pub enum FormatError {
         own: u64,
     },
     /// The length field of a message spans other records that follow the message.
-    #[error("a message with a length of {0} bytes extends over the records after it")]
+    #[error("a message of {0} bytes, by its length field, overlaps the records after it")]
     Swallowed(u64),
     /// A record reaches beyond the end of the file, but other records follow its beginning.
     #[error("a record of {bytes} bytes reaches beyond the end of the file, although other records follow it")]
@@ -164,7 +162,7 @@ pub enum FormatError {
     #[error("the file contains more bytes after the end of the recording")]
     TrailingData,
     /// The file holds another number of messages than its statistics record states.
-    #[error("the file contains {found} messages, but its statistics state {stated}")]
+    #[error("the file contains {found} messages, but its statistics say {stated}")]
     Messages {
         /// The number of messages read.
         found: u64,
@@ -172,7 +170,7 @@ pub enum FormatError {
         stated: u64,
     },
     /// The chunks decompress to far more bytes or records than a file of this length should.
-    #[error("{read} bytes unpack to more than {limit} {what}")]
+    #[error("{read} bytes unpack to too many {what}: the limit is {limit}")]
     Bomb {
         /// The number of bytes read.
         read: u64,

@@ -192,7 +192,7 @@ pub enum CdrError {
         what: &'static str,
     },
     /// A text is not UTF-8, or does not end with a NUL.
-    #[error("the text at byte {at} of a message is not UTF-8 with a NUL at its end")]
+    #[error("the text at byte {at} of a message is not UTF-8, or has no final NUL")]
     Text {
         /// The offset of the text in the message.
         at: usize,

@@ -26,15 +26,13 @@ pub enum ParameterError {
         joints: i16,
     },
     /// The normal does not have unit length.
-    #[error(
-        "the outward normal must have the length 1, but its squared length is {got} / 2^28; allowed: 63/64 to 65/64"
-    )]
+    #[error("the squared length of the outward normal is {got} / 2^28; it must be 63/64 to 65/64")]
     Normal {
         /// Square of the length, in steps of 2^-28.
         got: i64,
     },
     /// A gain or threshold is negative.
-    #[error("word {word} of the contact parameter is {got}; it must not be negative")]
+    #[error("word {word} (from 0) of the contact parameter is {got}; it must be 0 or more")]
     Negative {
         /// The index of the word, from 0.
         word: u8,
@@ -57,7 +55,7 @@ pub enum ParameterError {
     },
     /// The row that carries the cell is not the row of its joint or a fixed row after it.
     #[error(
-        "row {got} of {rows} cannot carry the cell; it must be the row of its joint, or a fixed row after it"
+        "row {got} of {rows} cannot carry the cell; use the row of the cell's joint, or a fixed row after it"
     )]
     Row {
         /// The requested row.

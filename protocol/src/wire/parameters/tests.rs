@@ -80,7 +80,7 @@ fn rows_are_checked_against_the_joints() {
     assert_eq!(says.check(), Ok(()));
     assert_eq!(
         rows(4, 3, &[turns, turns, fixed]).check().unwrap_err().to_string(),
-        "row 4 of 3 cannot carry the cell; it must be the row of its joint, or a fixed row after it"
+        "row 4 of 3 cannot carry the cell; use the row of the cell's joint, or a fixed row after it"
     );
     let mut kind = sound();
     assert_eq!(kind.set(Parameter::Row(3), [0, 0, 0, 0, 3, 0]).unwrap_err().code(), 9);

@@ -16,7 +16,7 @@ pub enum EditError {
     #[error(transparent)]
     Toml(#[from] toml_edit::TomlError),
     /// The text has no cells.
-    #[error("its cells are not [[cell]] tables")]
+    #[error("write its cells as [[cell]] tables")]
     NoCells,
     /// The numbers of cells in the text and in the skin differ.
     #[error("it has {found} cells, not {expected}")]

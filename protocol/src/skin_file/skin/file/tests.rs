@@ -122,8 +122,8 @@ fn a_text_of_another_skin_is_refused() {
     let skin = parsed(HAND);
     let said = |text: &str| SkinEdit::new(&skin, text).unwrap_err().to_string();
     assert_eq!(said("[[cell]]\nnode = 1\n"), "it has 1 cells, not 2");
-    assert_eq!(said("cell = 1\n"), "its cells are not [[cell]] tables");
-    assert_eq!(said("version = 1\n"), "its cells are not [[cell]] tables");
+    assert_eq!(said("cell = 1\n"), "write its cells as [[cell]] tables");
+    assert_eq!(said("version = 1\n"), "write its cells as [[cell]] tables");
     assert!(said("[[cell]\n").contains("TOML parse error"));
 }
 
