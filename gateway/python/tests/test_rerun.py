@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import os
+import re
+import signal
+import struct
 import subprocess
+import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,7 +21,14 @@ import skinbus
 from skinbus._ros2 import Reader
 
 rr = pytest.importorskip("rerun", reason='rerun-sdk is not installed: pip install "skinbus[rerun]"')
+from skinbus._rerun_live import LiveLog  # noqa: E402
+from skinbus._rerun_topics import Log, Topics  # noqa: E402
+from skinbus._rerun_view import eye, finish, unit_names  # noqa: E402
+from skinbus._scene import Link  # noqa: E402
+
 RECORDINGS = Path(__file__).parents[3] / "tests" / "recordings"
+# Colours of cells without a force, with an unknown one, and of silent cells.
+QUIET, UNKNOWN, DEAD = 0x46648CFF, 0xCDCDCDFF, 0xCD3CBEFF
 SKIN = Path(__file__).parents[3] / "gateway" / "examples" / "ur5-253.toml"
 
 
@@ -27,27 +39,44 @@ class Logged:
         from rerun.chunk import RrdReader
 
         self._columns: dict[str, dict[str, list[Any]]] = {}
-        self.static: set[str] = set()
+        self._static: dict[str, dict[str, list[Any]]] = {}
+        self.chunks = Counter[str]()
         for chunk in RrdReader(path).stream():
             batch = chunk.to_record_batch()
-            if chunk.is_static:
-                self.static.add(chunk.entity_path)
-                continue
-            columns = self._columns.setdefault(chunk.entity_path, {})
+            self.chunks[chunk.entity_path] += 1
+            every = self._static if chunk.is_static else self._columns
+            columns = every.setdefault(chunk.entity_path, {})
             for name in batch.schema.names:
                 column = batch.column(name)
                 # Times in ns have no equal in Python.
                 values = column.cast("int64") if name in ("time", "run", "log_time") else column
                 columns.setdefault(name, []).extend(values.to_pylist())
+            # A component that a chunk does not have has no values at its times.
+            count = max(map(len, columns.values()), default=0)
+            for values in columns.values():
+                values.extend([None] * (count - len(values)))
 
     @property
     def entities(self) -> set[str]:
         """The entities with values that change."""
         return set(self._columns)
 
+    @property
+    def static(self) -> set[str]:
+        """The entities with values that never change."""
+        return set(self._static)
+
+    def static_values(self, entity: str, component: str) -> list[Any]:
+        """Returns the values of a component that never change."""
+        return self._static[entity][component]
+
     def times(self, entity: str) -> NDArray[np.int64]:
         """Returns the times of an entity in ns since 1970."""
         return np.array(self._columns[entity]["time"], np.int64)
+
+    def runs(self, entity: str) -> NDArray[np.int64]:
+        """Returns the times of an entity in ns since the beginning of the run."""
+        return np.array(self._columns[entity]["run"], np.int64)
 
     def values(self, entity: str, component: str) -> list[Any]:
         """Returns the values of a component, one list of instances for each time."""
@@ -55,7 +84,7 @@ class Logged:
 
     def scalars(self, entity: str) -> NDArray[np.float64]:
         """Returns the only scalar at each time."""
-        return np.array([one for (one,) in self.values(entity, "Scalars:scalars")], np.float64)
+        return np.array([one[0] for one in self.values(entity, "Scalars:scalars") if one], np.float64)
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +114,7 @@ def test_the_series_are_those_of_read(demo: Path, logged: Logged) -> None:
                 (f"/joints/{name}", epochs.positions),
                 (f"/torques/{name}/distributed", epochs.distributed),
                 (f"/torques/{name}/central", epochs.central),
-                (f"/torques/{name}/difference", epochs.error),
+                (f"/torques/{name}/difference", np.where(epochs.open_cells[:, np.newaxis] > 0, np.nan, epochs.error)),
             ):
                 np.testing.assert_array_equal(logged.times(entity), epochs.at_ns)
                 np.testing.assert_array_equal(logged.scalars(entity), expected[:, at])
@@ -110,6 +139,8 @@ def test_cells_and_forces_are_where_the_recording_has_them(demo: Path, logged: L
     touched = 0
     for entity in patches:
         forces = entity.replace("/cells/", "/forces/")
+        ((radius,),) = logged.static_values(entity, "Points3D:radii")
+        assert 0.003 < radius < 0.015
         every = zip(
             logged.values(entity, "Points3D:positions"),
             logged.values(entity, "Points3D:colors"),
@@ -119,11 +150,11 @@ def test_cells_and_forces_are_where_the_recording_has_them(demo: Path, logged: L
         )
         for positions, colors, origins, vectors in every:
             assert len(colors) == len(positions)
-            assert len(vectors) == len(origins) == sum(color != 0x00224EFF for color in colors if color != 0x808080FF)
+            assert len(vectors) == len(origins) == sum(color not in (QUIET, UNKNOWN) for color in colors)
             for origin, vector in zip(origins, vectors, strict=True):
-                # An arrow ends at its cell.
-                tip = np.array(origin) + np.array(vector)
-                distances = np.linalg.norm(np.array(positions) - tip, axis=1)
+                # An arrow ends at the surface of its cell, in the direction of the cell.
+                tip, direction = np.array(origin) + np.array(vector), np.array(vector) / np.linalg.norm(vector)
+                distances = np.linalg.norm(np.array(positions) - (tip + direction * radius), axis=1)
                 assert distances.min() < 1e-5
                 touched += 1
         assert {entity, forces} <= logged.static
@@ -134,8 +165,89 @@ def test_links_move_with_the_joints(logged: Logged) -> None:
     every = logged.values("/robot/links", "LineStrips3D:strips")
     assert len(every) > 20
     assert all(len(strips) == 6 for strips in every)
-    lengths = [[np.linalg.norm(np.subtract(end, begin)) for begin, end in strips] for strips in every]
-    np.testing.assert_allclose(lengths, np.broadcast_to(lengths[0], (len(lengths), 6)), atol=1e-6)
+    lengths = [np.concatenate([np.linalg.norm(np.diff(strip, axis=0), axis=1) for strip in strips]) for strips in every]
+    np.testing.assert_allclose(lengths, np.broadcast_to(lengths[0], (len(lengths), len(lengths[0]))), atol=1e-6)
+    # The two links with cells run along the axis of their cells.
+    assert sorted(len(strip) for strip in every[0]) == [2, 2, 2, 2, 4, 4]
+
+
+def test_cells_have_names_and_forces(demo: Path, logged: Logged) -> None:
+    with skinbus.read(demo) as recording:
+        names = {str(cell) for cell in recording.cells}
+    patches = [entity for entity in logged.entities if entity.startswith("/robot/cells/")]
+    labels = [label for entity in patches for label in logged.values(entity, "Points3D:labels")[-1]]
+    assert {label.split(", ")[0] for label in labels} == names
+    assert all(re.fullmatch(r"\S+, (\d+\.\d\d N|force unknown|silent)", label) for label in labels)
+    assert all(logged.static_values(entity, "Points3D:show_labels") == [[False]] for entity in patches)
+
+
+def test_a_recording_has_a_name_and_a_beginning(demo: Path, logged: Logged) -> None:
+    with skinbus.read(demo) as recording:
+        assert ["run.mcap"] in logged.static_values("/__properties", "RecordingInfo:name")
+        assert [recording.began_ns] in logged.static_values("/__properties", "RecordingInfo:start_time")
+
+
+def test_a_joint_has_one_colour_and_its_name_in_all_views(logged: Logged) -> None:
+    colors = set()
+    for at in range(1, 7):
+        name = f"joint{at}"
+        entities = [f"/joints/{name}", f"/torques/{name}/distributed", f"/torques/{name}/difference"]
+        assert all(logged.static_values(entity, "SeriesLines:names") == [[name]] for entity in entities)
+        (color,) = {logged.static_values(entity, "SeriesLines:colors")[0][0] for entity in entities}
+        colors.add(color)
+    assert len(colors) == 6
+
+
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of a bench whose cell 12 is touched, dies and comes back."""
+    path = tmp_path_factory.mktemp("faulty") / "run.mcap"
+    with skinbus.Bench(SKIN, record=path) as bench:
+        cell_dies_and_is_back(bench)
+    return path
+
+
+def cell_dies_and_is_back(bench: skinbus.Bench) -> None:
+    bench.press(12, 3.0)
+    bench.kill(12)
+    bench.wait_for(skinbus.CellState, lambda event: event.state == "dead")
+    bench.wait_epochs(30)
+    bench.restart(12)
+    bench.wait_epochs(30)
+
+
+def assert_cell_is_silent_and_back(logged: Logged) -> None:
+    texts = [text.partition(": ")[2] for (text,) in logged.values("/contacts", "TextLog:text")]
+    assert [text for text in texts if text.startswith("vcan0:12 ") and "touched" not in text] == [
+        "vcan0:12 has fallen silent",
+        "vcan0:12 is back",
+    ]
+    silent = 0
+    for entity in logged.entities:
+        if entity.startswith("/robot/cells/"):
+            colors, labels = (logged.values(entity, f"Points3D:{name}") for name in ("colors", "labels"))
+            arrows = logged.values(entity.replace("/cells/", "/forces/"), "Arrows3D:vectors")
+            for shown, named, vectors in zip(colors, labels, arrows, strict=True):
+                if shown is None or DEAD not in shown:
+                    continue
+                silent += 1
+                assert named[shown.index(DEAD)] == "vcan0:12, silent"
+                assert not vectors
+    assert silent > 3
+
+
+def test_a_silent_cell_looks_silent(faulty: Path, tmp_path: Path) -> None:
+    skinbus.to_rerun(faulty, save=tmp_path / "run.rrd")
+    logged = Logged(tmp_path / "run.rrd")
+    assert_cell_is_silent_and_back(logged)
+    with skinbus.read(faulty, index=False) as recording:
+        epochs = recording.epochs()
+        is_open = np.asarray(epochs.open_cells) > 0
+        assert is_open.any()
+        assert not np.isnan(epochs.error[is_open]).all()
+        shown = logged.scalars("/torques/joint1/difference")
+        assert np.isnan(shown[is_open]).all()
+        assert not np.isnan(shown[~is_open]).all()
 
 
 def test_a_log_has_series_and_parts_are_one_recording(tmp_path: Path) -> None:
@@ -170,7 +282,16 @@ def test_a_bench_is_logged_while_it_runs(live: tuple[Path, str]) -> None:
     path, cell = live
     logged = Logged(path)
     texts = [text for (text,) in logged.values("/contacts", "TextLog:text")]
-    assert texts[:2] == [f"{cell} is touched", f"{cell} is no longer touched"]
+    assert [text.partition(": ")[2] for text in texts] == [
+        f"{cell} is touched",
+        f"{cell} is no longer touched",
+        "the log has ended",
+    ]
+    # The run began before the log.
+    times = logged.runs("/joints/joint1")
+    assert 0 < times[0] < 60e9
+    np.testing.assert_array_equal(np.diff(times), np.diff(logged.times("/joints/joint1")))
+    assert_is_cleared(logged)
     joints = {entity for entity in logged.entities if entity.startswith("/joints/")}
     assert len(joints) == 6
     assert all(len(logged.scalars(entity)) > 30 for entity in joints)
@@ -180,7 +301,142 @@ def test_a_bench_is_logged_while_it_runs(live: tuple[Path, str]) -> None:
     assert arrows
     np.testing.assert_allclose([np.linalg.norm(vectors[0]) for vectors in arrows], 0.08, rtol=1e-2)
     distributed = [logged.scalars(entity) for entity in logged.entities if entity.endswith("/distributed")]
-    assert max(float(np.max(np.abs(values))) for values in distributed) > 0.1
+    assert max(float(np.nanmax(np.abs(values))) for values in distributed) > 0.1
+
+
+def assert_is_cleared(logged: Logged) -> None:
+    """Nothing stands as current at the end, and no line leads on."""
+    for entity in ("/torques", "/joints", "/robot"):
+        assert logged.values(entity, "Clear:is_recursive")[-1] == [True]
+    for entity in logged.entities:
+        if entity.startswith(("/joints/", "/torques/")):
+            assert np.isnan(logged.scalars(entity)[-1])
+            assert logged.times(entity)[-1] == logged.times("/joints")[-1]
+
+
+@pytest.fixture
+def live_bench(tmp_path: Path) -> Iterator[tuple[skinbus.Bench, LiveLog, Path]]:
+    """A bench that is killed, and its log."""
+    path = tmp_path / "live.rrd"
+    bench = skinbus.Bench(SKIN).start()
+    try:
+        log = skinbus.to_rerun(bench, save=path)
+        bench.wait_epochs(30)
+        yield bench, log, path
+    finally:
+        bench.abort()
+
+
+def last_text(path: Path, log: LiveLog) -> str:
+    log.close()
+    (text,) = Logged(path).values("/contacts", "TextLog:text")[-1]
+    assert isinstance(text, str)
+    return text.partition(": ")[2]
+
+
+def test_a_killed_bench_leaves_nothing_that_looks_current(live_bench: tuple[skinbus.Bench, LiveLog, Path]) -> None:
+    bench, log, path = live_bench
+    bench.abort()
+    for thread in log._threads:
+        thread.join(10.0)
+        assert not thread.is_alive()
+    assert last_text(path, log) == "the bench has ended"
+    assert_is_cleared(Logged(path))
+
+
+def test_a_killed_view_leaves_nothing_that_looks_current(live_bench: tuple[skinbus.Bench, LiveLog, Path]) -> None:
+    bench, log, path = live_bench
+    log._view.send_signal(signal.SIGKILL)
+    log._threads[0].join(10.0)
+    bench.press(120, 4.0)
+    deadline = time.monotonic() + 10.0
+    while bench.events(skinbus.Contact) == [] and time.monotonic() < deadline:
+        time.sleep(0.05)
+    log.close()
+    logged = Logged(path)
+    texts = [text.partition(": ")[2] for (text,) in logged.values("/contacts", "TextLog:text")]
+    assert texts == ["the view has ended", "vcan0:120 is touched", "the log has ended"]
+    assert_is_cleared(logged)
+
+
+def test_a_silent_cell_looks_silent_while_a_bench_runs(tmp_path: Path) -> None:
+    path = tmp_path / "live.rrd"
+    with skinbus.Bench(SKIN) as bench, skinbus.to_rerun(bench, save=path):
+        cell_dies_and_is_back(bench)
+    logged = Logged(path)
+    assert_cell_is_silent_and_back(logged)
+    assert np.isnan(logged.scalars("/torques/joint1/difference")[:-1]).any()
+
+
+def test_a_second_bench_does_not_restart_the_timeline(tmp_path: Path) -> None:
+    path = tmp_path / "live.rrd"
+    stream = rr.RecordingStream("two benches")
+    stream.save(path)
+    for _ in range(2):
+        with skinbus.Bench(SKIN) as bench, skinbus.to_rerun(bench, recording=stream):
+            bench.wait_epochs(30)
+    stream.disconnect()
+    logged = Logged(path)
+    times = logged.runs("/joints/joint1")
+    np.testing.assert_array_equal(np.diff(times), np.diff(logged.times("/joints/joint1")))
+    assert np.count_nonzero(np.isnan(logged.scalars("/joints/joint1"))) == 2
+
+
+def torques(distributed: list[float], central: list[float]) -> bytes:
+    """Returns a message `skinbus_msgs/Torques`."""
+    sequences = b"".join(struct.pack(f"<II{len(each)}d", len(each), 0, *each) for each in (distributed, central))
+    header = struct.pack("<iiI", 1, 500_000_000, 1) + bytes(4)
+    return b"\x00\x01\x00\x00" + header + sequences
+
+
+def test_torques_are_logged_while_central_ones_are_unknown(tmp_path: Path) -> None:
+    stream = rr.RecordingStream("torques")
+    stream.save(tmp_path / "torques.rrd")
+    topics = Topics(Log(stream, 1_000_000_000), ["a", "b"], {("a", "b")})
+    topics.add("/arm/torques", torques([1.0, 2.0], []), [])
+    topics.add("/arm/torques", torques([1.0, 2.0], [0.5, 0.5]), [])
+    topics.end(2_000_000_000)
+    stream.disconnect()
+    logged, unknown = Logged(tmp_path / "torques.rrd"), float("nan")
+    for series, expected in (("distributed", [2.0, 2.0]), ("central", [unknown, 0.5]), ("difference", [unknown, 1.5])):
+        entity = f"/torques/b/{series}"
+        np.testing.assert_array_equal(logged.scalars(entity), [*expected, unknown])
+        assert logged.runs(entity).tolist() == [500_000_000, 500_000_000, 1_000_000_000]
+        # Sent together.
+        assert logged.chunks[entity] <= 2
+
+
+def test_a_closed_viewer_is_a_warning() -> None:
+    class Closed:
+        def flush(self) -> None:
+            raise RuntimeError("the sink is gone")
+
+    with pytest.warns(UserWarning, match="the viewer did not receive everything: the sink is gone"):
+        finish(cast(Any, Closed()), is_own=False)
+    with pytest.raises(RuntimeError, match="the sink is gone"):
+        finish(cast(Any, Closed()), is_own=True)
+
+
+@pytest.mark.parametrize("scale", [0.3, 1.0, 3.0])
+def test_the_eye_sees_the_whole_robot(scale: float) -> None:
+    points = np.random.default_rng(1).uniform(-1, 1, (200, 3)) * scale + [0, 0, scale]
+    found = eye([], [Link(points, 0.03)])
+    assert found is not None
+    assert found.position is not None
+    assert found.look_target is not None
+    position, target = (np.array(one.as_arrow_array().to_pylist()[0]) for one in (found.position, found.look_target))
+    ahead = (target - position) / np.linalg.norm(target - position)
+    # Half of the height that the viewer sees is 27.5 degrees.
+    cosines = (points - position) @ ahead / np.linalg.norm(points - position, axis=1)
+    assert cosines.min() > np.cos(np.radians(27.5 * 2**0.5))
+    assert np.linalg.norm(position - target) < 6 * scale
+    assert eye([], []) is None
+
+
+def test_units_follow_the_joints() -> None:
+    assert unit_names([("rad", "Nm"), ("rad", "Nm")]) == ("rad", "Nm")
+    assert unit_names([("rad", "Nm"), ("m", "N")]) == ("rad or m", "Nm or N")
+    assert unit_names([]) == ("rad or m", "Nm or N")
 
 
 def test_a_message_of_another_encoding_is_refused() -> None:

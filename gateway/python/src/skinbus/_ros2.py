@@ -31,12 +31,18 @@ class Torques:
     central: NDArray[np.float64]
 
 
+# Values of `PatchState.status`: in contact without a reply to the last epoch; silent for longer than the timeout.
+STALE, DEAD = 3, 4
+
+
 @dataclass(frozen=True)
 class Patch:
-    """`skinbus_msgs/PatchState`: the link and the node ids of a patch."""
+    """`skinbus_msgs/PatchState`: the link, and the node ids and statuses of the cells of a patch."""
 
+    at_ns: int
     link: str
     nodes: tuple[int, ...]
+    statuses: NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -119,12 +125,19 @@ def torques(message: bytes) -> Torques:
 
 
 def patch(message: bytes) -> Patch:
-    """Decodes the link and the nodes of `skinbus_msgs/PatchState`."""
+    """Decodes `skinbus_msgs/PatchState` without forces and proximities."""
     reader = Reader(message)
-    reader.stamp()
-    link = reader.text()
+    at_ns, link = reader.stamp(), reader.text()
     reader.number("B")
-    return Patch(link, tuple(int(node) for node in np.asarray(reader.array("u2"), np.int64)))
+    nodes = tuple(int(node) for node in np.asarray(reader.array("u2"), np.int64))
+    for _ in ("force", "proximity"):
+        reader.array("f4")
+    return Patch(at_ns, link, nodes, np.asarray(reader.array("u1"), np.uint8))
+
+
+def string(message: bytes) -> str:
+    """Decodes `std_msgs/String`."""
+    return Reader(message).text()
 
 
 def points(message: bytes) -> Points:
