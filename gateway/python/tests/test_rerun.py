@@ -28,7 +28,7 @@ from skinbus._scene import Link  # noqa: E402
 
 RECORDINGS = Path(__file__).parents[3] / "tests" / "recordings"
 # Colours of cells without a force, with an unknown one, and of silent cells.
-QUIET, UNKNOWN, DEAD = 0x46648CFF, 0xCDCDCDFF, 0xCD3CBEFF
+QUIET, UNKNOWN, DEAD = 0x46648CFF, 0x919191FF, 0xCD3CBEFF
 SKIN = Path(__file__).parents[3] / "gateway" / "examples" / "ur5-253.toml"
 
 
@@ -431,6 +431,11 @@ def test_the_eye_sees_the_whole_robot(scale: float) -> None:
     assert cosines.min() > np.cos(np.radians(27.5 * 2**0.5))
     assert np.linalg.norm(position - target) < 6 * scale
     assert eye([], []) is None
+    # A running bench moves.
+    live = eye([], [Link(points, 0.03)], is_live=True)
+    assert live is not None
+    assert live.position is not None
+    assert live.position.as_arrow_array() != found.position.as_arrow_array()
 
 
 def test_units_follow_the_joints() -> None:

@@ -13,11 +13,9 @@ from skinbus._rerun_view import entity_path, time_columns
 from skinbus._scene import Cells, Scene
 
 # Values of series are sent together after this time in ns: a chunk for each value would slow the viewer down.
-_BATCH_NS = 100_000_000
+_BATCH_NS = 200_000_000
 # Time in ns after which the views are sent even if cells of a patch are missing.
 _SCENE_TIMEOUT_NS = 2_000_000_000
-# The eye of a running bench leaves room for motion.
-_EYE_MARGIN = 1.25
 
 
 class Log:
@@ -106,7 +104,7 @@ class Topics:
                 self._add_cells(cells)
         if self._joints not in self._viewed and self._is_complete(topics):
             self._viewed.add(self._joints)
-            eye = view.eye(self._first.values(), self._scene.links(), margin=_EYE_MARGIN)
+            eye = view.eye(self._first.values(), self._scene.links(), is_live=True)
             view.send_view(self._log.stream, self._joints, self._units, eye=eye, duration=None)
 
     def end(self, at_ns: int) -> None:

@@ -14,7 +14,7 @@ _ARROW_M_PER_N = 0.02
 # Forces from this one on have the brightest colour, in N.
 _BRIGHT_N = 10.0
 _DARK, _BRIGHT = np.array([70, 100, 140]), np.array([254, 232, 56])
-_UNKNOWN, _DEAD = np.array([205, 205, 205]), np.array([205, 60, 190])
+_UNKNOWN, _DEAD = np.array([145, 145, 145]), np.array([205, 60, 190])
 # Radii of cells in m: a share of the distance between neighbours, within limits.
 _PITCH_SHARE, _CELL_RADIUS_M, _SMALLEST_CELL_M, _LARGEST_CELL_M = 0.45, 0.008, 0.003, 0.015
 # Radii of links in m: a share of the distance between the cells and their axis, within a limit.
