@@ -17,7 +17,7 @@ from skinbus._scene import Cells, Link
 Floats = NDArray[np.float64]
 Units = Sequence[tuple[str, str]]
 
-_LINK_COLOR = (64, 68, 72)
+_LINK_COLOR = (82, 86, 92)
 _ARROW_COLOR = (230, 60, 60)
 # Colours of joints, which repeat after the last one.
 _JOINT_COLORS = (
