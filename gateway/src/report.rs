@@ -14,7 +14,7 @@ use protocol::wire_time::parse_bit_rate;
 use super::input::{first_skin_difference, read_skin};
 use super::output::{OverwriteOption, check_distinct_files, is_standard_output, print_note};
 
-/// Write an HTML report on a recorded run, beside figures of a paper (docs/explanation/paper.md)
+/// Write an HTML report on a recorded run, beside figures of docs/explanation/paper.md
 ///
 /// The page is one file that loads nothing, and readable on a phone, on a dark screen and on paper. Pointer, finger or
 /// arrow keys show the values of its figures. For a recording that was cut off, the report covers the intact part, and names what is missing on the page

@@ -122,8 +122,8 @@ fn add_accuracy_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bo
         rows.add_section("accuracy", "mean (max) error, Nm", "against central torques");
     }
     let name = |short: &'static str, long: &'static str| if is_verbose { long } else { short };
-    let of_paper =
-        |errors: &TorqueErrors, paper: f64| format!("{}, paper: mean {paper}", format_torque_count(errors));
+    let mean = name("", ": mean");
+    let of_paper = |errors, paper: f64| format!("{}, paper{mean} {paper}", format_torque_count(errors));
     if single {
         let errors = &accuracy.single;
         rows.add_row(
@@ -223,8 +223,8 @@ fn add_control_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: boo
 
 fn add_reply_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     let replies = &bus.replies;
-    let what = format!("cells at the end; {} bus", bus.kind);
-    rows.add_section(&bus.name, frames::cells_by_status(&bus.cells), what);
+    let cells = format!("cells: {}", frames::cells_by_status(&bus.cells));
+    rows.add_section(&bus.name, cells, format!("at the end; {} bus", bus.kind));
     if bus.outages.times > 0 {
         let end = if bus.outages.at_end { ", also at the end" } else { "" };
         let ticks = format!("{} ran without this bus", count_with_noun(bus.outages.ticks, "tick"));
