@@ -54,8 +54,8 @@ pub(crate) struct DumpCommand {
     #[arg(required = true, value_name = "BUS|FILE")]
     sources: Vec<PathBuf>,
     /// Show only frames of these kinds: command, sum, torque, sensors, network, configure, configured, stimulus, wire
-    /// (simulated wires), foreign (of other protocols, or damaged), damaged (under an identifier that carries packets);
-    /// or these commands: halt, joints, sync, resume, report
+    /// (simulated wires), foreign (of other protocols, or damaged), damaged; or of one command: halt, joints, sync,
+    /// resume, report
     #[arg(long, value_name = "KIND", value_delimiter = ',')]
     kind: Vec<FrameSelector>,
     /// Show only packets from or to these nodes: a node id, BUS:NODE, gateway or everyone

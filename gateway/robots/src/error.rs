@@ -34,14 +34,14 @@ pub enum RobotProblem {
     #[error("the file is empty; a URDF has a robot element with links and joints")]
     Empty,
     /// The file does not begin like an XML file.
-    #[error("not XML: a URDF begins with <?xml or <robot; name the robot's URDF")]
+    #[error("not XML: a URDF begins with <?xml or <robot; give the path of the robot's URDF")]
     NotXml,
     /// The file is not readable XML. The text says what is wrong and what to do.
     #[error("{0}")]
     Xml(String),
     /// The file is a xacro template, from which a URDF must be generated first.
     #[error(
-        "{what} is not expanded: this is a xacro file, a template of a URDF. Generate the URDF with `xacrodoc {file} -o NEW.urdf` (pip install xacrodoc), and name that file"
+        "{what} is not expanded: this is a xacro file, a template of a URDF. Generate the URDF with `xacrodoc {file} -o NEW.urdf` (pip install xacrodoc), and give its path"
     )]
     Xacro {
         /// The xacro element or expression.
@@ -50,10 +50,10 @@ pub enum RobotProblem {
         file: String,
     },
     /// The file is XML, but its root element is not that of a URDF.
-    #[error("the outermost element is {0}; a URDF has `robot`: name the robot's URDF")]
+    #[error("the outermost element is {0}; that of a URDF is `robot`: give the path of the robot's URDF")]
     NotARobot(String),
     /// The file is an SRDF, which defines groups of a robot's joints.
-    #[error("this is an SRDF file (MoveIt), which has no links: name the robot's URDF")]
+    #[error("this is an SRDF file (MoveIt), which has no links: give the path of the robot's URDF")]
     Srdf,
     /// The robot has no links.
     #[error("the robot has no links; a URDF has at least one")]

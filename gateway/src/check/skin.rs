@@ -97,10 +97,12 @@ fn describe(skin: &Skin) -> String {
         let parts =
             comma_separated(by_joint.iter().map(|(joint, cells)| format!("{cells} on joint {joint}")));
         let roots: Vec<_> = skin.cells_on_bus(index).filter(|cell| cell.root).map(|cell| cell.node).collect();
+        // Cells that send torques have no use for a root.
         let roots = match roots.as_slice() {
-            [] => "no root".to_owned(),
-            [root] => format!("root: cell {root}"),
-            roots => format!("roots: cells {}", space_separated(roots)),
+            _ if bus.reply == SkinReply::Torque => String::new(),
+            [] => "; no root".to_owned(),
+            [root] => format!("; root: cell {root}"),
+            roots => format!("; roots: cells {}", space_separated(roots)),
         };
         let rates = bus.bitrate.map(|nominal| match bus.data_bitrate {
             Some(data) => format!(", {nominal} and {data} bit/s"),
@@ -117,7 +119,7 @@ fn describe(skin: &Skin) -> String {
             format @ (TorqueFormat::Q5_10 | TorqueFormat::Q7_8) => format!(", torques in {}", format.name()),
         };
         text += &format!(
-            "bus {} ({format}{rates}{chain}, {reply}{torques}): {cells}: {parts}; {roots}\n",
+            "bus {} ({format}{rates}{chain}, {reply}{torques}): {cells}: {parts}{roots}\n",
             bus.name
         );
     }

@@ -280,7 +280,7 @@ fn format_force_steps(force: &ForceSteps, zero: u64) -> String {
         [touch_n >= contact_threshold_n, proximity >= proximity_threshold].map(counts);
     format!(
         "  sensors    contact {a:.4} + {b:.4} + {c:.4} N, proximity {proximity:.4}\n  \
-         since      {origin}\n  \
+         set by     {origin}\n  \
          contact    F_c = {touch_n:.4} N, {touch} its threshold of {contact_threshold_n:.4} N: {touch_counts}\n  \
          proximity  F_p = {proximity:.4}, {near} its threshold of {proximity_threshold:.4}: {near_counts}\n  \
          force      F_z = {alpha_c:.4} F_c + {alpha_p_n:.4} F_p = {fused_n:.6} N, {fused} its threshold of \

@@ -55,7 +55,7 @@ pub(super) fn table(skin: &Skin, rows: &[RatesRow]) -> String {
          on the bus\nload    bus load in the worst case, when all cells answer: joints messages, {}, heartbeats{}\nlast    \
          longest time from the scheduled joints message to the end of the last answer\ncells   cells that a bus can \
          serve in time; but transceivers can drive only about {}\nbuses   buses that {cells} cells need and, if \
-         several, the limit behind this: time or nodes\nroots   load and last if cells send sums and only the roots \
+         several, what limits a bus: time or nodes\nroots   load and last if cells send sums and only the roots \
          are on this bus; if all cells are on it, sums save no frames\n",
         printable(&skin.name),
         format_millis(case.period_ns),

@@ -14,7 +14,7 @@ use super::addressee::{addressee, single_cell};
 use crate::arguments::{OptionValue, one_of_values};
 use model::decode::pick::NodeSelector;
 
-/// Set when cells send their sensor values: never, at a rate, or on changes
+/// Make cells send their sensor values never, at a rate, or on changes
 ///
 /// With --bus or --skin, takes effect at once, waits until all cells have confirmed it, and lists those that have not.
 /// A gateway that runs on the bus overrides it, because it switches a restarted cell back to the cell's last mode.

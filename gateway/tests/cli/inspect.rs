@@ -253,7 +253,7 @@ fn the_worked_example_of_the_document_is_explained_in_a_terminal() {
     for line in [
         "run.log: joints message of epoch 7 on vcan0, 0.200000 s after the first frame",
         "  sensors    contact 1.0000 + 1.0000 + 1.0000 N, proximity 0.0000",
-        "  since      the stimulus at 0.100000 s, in effect from the next joints message on",
+        "  set by     the stimulus at 0.100000 s, in effect from the next joints message on",
         "  contact    F_c = 3.0000 N, at least its threshold of 0.1006 N: counts",
         "  proximity  F_p = 0.0000, below its threshold of 0.0500: does not count",
         "  force      F_z = 1.0000 F_c + 0.0000 F_p = 3.000000 N, at least its threshold of 0.1006 N",

@@ -72,7 +72,7 @@ fn a_page_kills_stops_and_restarts_cells() {
         (r#"{"do":"link","cells":[1,2],"down":true}"#, "link down between cell 1 and cell 2 on vcan0: "),
         (
             r#"{"do":"bus","bus":"vcan0","down":false}"#,
-            "bus vcan0 up: no command of this run has taken this bus down",
+            "bus vcan0 up: only a bus that a command of this run took down can be brought up",
         ),
     ] {
         page.send(command);

@@ -75,7 +75,7 @@ pub enum PlanRefusal {
     },
     /// Both ends of a pair in one namespace were given one name.
     #[error(
-        "{0} cannot be both ends of a pair in one network namespace: give --peer another name, or --namespace"
+        "{0} cannot be both ends of a pair in one network namespace: give another name to --peer, or add --namespace"
     )]
     OneName(String),
     /// The interface does not exist. It is hardware, because the skin states a bit rate for it.

@@ -91,7 +91,7 @@ pub enum LaunchError {
 
 /// The error of a system that grants no file in memory.
 #[derive(Debug, Error)]
-#[error("cannot create the skin file for cells in memory: {0}")]
+#[error("cannot hand the skin to the processes of cells: {0}")]
 pub struct MemoryFileError(#[source] std::io::Error);
 
 /// Raises the limit of open files for this process and all processes that it starts, so that a gateway can use `buses`

@@ -79,7 +79,7 @@ pub enum ReplayError {
     /// Standard input cannot be read twice.
     #[error(
         "a replay reads its input twice, which is impossible with standard input: save the frames to a file, \
-         and name that file"
+         and give its path"
     )]
     StandardInput,
     /// A pipe cannot be read twice.

@@ -103,7 +103,7 @@ pub(super) enum CommandError {
     NoLinks,
     #[error("the bus is already down")]
     AlreadyDown,
-    #[error("no command of this run has taken this bus down")]
+    #[error("only a bus that a command of this run took down can be brought up")]
     NotTakenDown,
     #[error("the bus was already brought up, but does not work yet")]
     ComesUp,

@@ -106,7 +106,7 @@ fn a_file_of_another_kind_is_named() {
     );
     let other = |element: &str, kind: &str| {
         let expected = format!(
-            "t.urdf:1: the outermost element is {element:?}{kind}; a URDF has `robot`: name the robot's URDF"
+            "t.urdf:1: the outermost element is {element:?}{kind}; that of a URDF is `robot`: give the path of the robot's URDF"
         );
         assert_eq!(refused(&format!("<{element}/>")), expected);
     };
@@ -118,7 +118,7 @@ fn a_file_of_another_kind_is_named() {
         "<robot name=\"r\">\n<group name=\"arm\"><chain base_link=\"a\" tip_link=\"b\"/></group></robot>";
     assert_eq!(
         refused(srdf),
-        "t.urdf:1: this is an SRDF file (MoveIt), which has no links: name the robot's URDF"
+        "t.urdf:1: this is an SRDF file (MoveIt), which has no links: give the path of the robot's URDF"
     );
 }
 

@@ -33,12 +33,12 @@ fn files_that_are_no_urdf() {
     assert_eq!(parse("\u{feff} \n"), empty);
     assert_eq!(
         parse("robot"),
-        "t.urdf:1: not XML: a URDF begins with <?xml or <robot; name the robot's URDF"
+        "t.urdf:1: not XML: a URDF begins with <?xml or <robot; give the path of the robot's URDF"
     );
     assert_eq!(
         parse("<sdf/>"),
-        "t.urdf:1: the outermost element is \"sdf\" (an SDF file of Gazebo); a URDF has `robot`: name the \
-         robot's URDF"
+        "t.urdf:1: the outermost element is \"sdf\" (an SDF file of Gazebo); that of a URDF is `robot`: give \
+         the path of the robot's URDF"
     );
     assert_eq!(parse("<robot/>"), "t.urdf:1: the robot has no links; a URDF has at least one");
     // Lines are those of the file, whatever stands before the first tag.
@@ -47,7 +47,7 @@ fn files_that_are_no_urdf() {
 
 #[test]
 fn xacro_is_refused_where_it_was_not_run() {
-    let why = "is not expanded: this is a xacro file, a template of a URDF. Generate the URDF with `xacrodoc t.urdf -o NEW.urdf` (pip install xacrodoc), and name that file";
+    let why = "is not expanded: this is a xacro file, a template of a URDF. Generate the URDF with `xacrodoc t.urdf -o NEW.urdf` (pip install xacrodoc), and give its path";
     let bound =
         "<robot xmlns:xacro=\"http://www.ros.org/wiki/xacro\">\n<xacro:arm/><link name=\"a\"/></robot>";
     assert_eq!(parse(bound), format!("t.urdf:2: element <xacro:arm> {why}"));
