@@ -67,9 +67,7 @@ pub(crate) enum LinkError {
     #[error("'{0}' cannot be part of a Zenoh key: {1}")]
     Name(String, String),
     /// Another process of this machine already links the bus.
-    #[error(
-        "the bus '{0}' is already linked by a process on this host: use it for all hosts, or stop it"
-    )]
+    #[error("the bus '{0}' is already linked by a process on this host: use it for all hosts, or stop it")]
     Twice(String),
     /// The system call that waits for frames failed.
     #[error("cannot wait for frames: {0}")]
