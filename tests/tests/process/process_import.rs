@@ -219,7 +219,7 @@ fn what_is_no_chain_of_joints_is_said_in_a_line() {
     for (text, words, expected) in [
         (floating.as_str(), "--tip bare", "joint \"shoulder\" is floating"),
         (&mimic, "--tip bare", "joint \"shoulder\" mimics \"elbow\""),
-        (&far, "--tip bare", "; it must be "),
+        (&far, "--tip bare", "; allowed: [-2, 2) m; "),
         ("", "--tip bare", "the file is empty"),
         (
             "<robot xmlns:xacro=\"x\"><xacro:a/></robot>",
