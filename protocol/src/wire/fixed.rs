@@ -354,6 +354,13 @@ mod tests {
     }
 
     #[test]
+    fn words_of_all_torque_formats_are_steps_of_the_finest() {
+        let formats = [TorqueFormat::Q3_12, TorqueFormat::Q5_10, TorqueFormat::Q7_8];
+        assert_eq!(formats.map(|format| format.to_finest_steps(-3)), [-3, -12, -48]);
+        assert_eq!(formats.map(|format| format.to_finest_steps(i16::MAX)), [32_767, 131_068, 524_272]);
+    }
+
+    #[test]
     fn every_word_comes_back_through_f64_and_agrees_with_the_fixed_crate() {
         for bits in i16::MIN..=i16::MAX {
             assert_eq!(Q1_14::nearest(Q1_14::from_bits(bits).to_f64()).to_bits(), bits);

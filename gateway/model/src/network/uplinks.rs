@@ -297,4 +297,21 @@ mod tests {
         );
         assert_eq!(walks(&mut uplinks), [(0, walk(10, 6, CellId::MAX.get()))]);
     }
+
+    #[test]
+    fn a_repair_starts_a_round_later_than_its_own_but_never_an_earlier_one() {
+        let mut uplinks = Uplinks::new(1, 0, Micros(0));
+        let mut round_after = |repair| {
+            uplinks.handle_message(Micros(0), 0, PortMessage::Repair(repair));
+            said(&mut uplinks).into_iter().find_map(|(_, message)| {
+                if let PortMessage::Hello(hello) = message { hello.rank.map(|rank| rank.round) } else { None }
+            })
+        };
+        // Rounds are compared modulo 256.
+        let rounds =
+            [(7, 8), (8, 9), (3, 9), (9, 10), (120, 121), (240, 241), (250, 251), (255, 0), (250, 0)];
+        for (repair, round) in rounds {
+            assert_eq!(round_after(repair), Some(round), "after a repair of round {repair}");
+        }
+    }
 }

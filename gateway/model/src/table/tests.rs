@@ -412,3 +412,19 @@ fn epochs_with_a_torque_that_was_not_due_are_not_the_whole_skin() {
     assert_eq!((replies.contact_unknown, replies.unasked), (5, 5));
     assert!(there.compared().1 <= whole + 6, "the epoch before may still close");
 }
+
+#[test]
+fn a_cell_measures_unless_its_heartbeats_say_test_mode() {
+    let from = Node::Cell(CellId::new(1).unwrap());
+    let heartbeat = |state| {
+        let page = NetworkPage::Heartbeat(Heartbeat { state, ..Heartbeat::default() });
+        (false, Message::Network { from, epoch: Epoch(0), page })
+    };
+    for (heard, is_measuring) in [
+        (vec![], None),
+        (vec![heartbeat(State::CONFIGURED)], Some(true)),
+        (vec![heartbeat(State(State::CONFIGURED.0 | State::TEST_MODE.0))], Some(false)),
+    ] {
+        assert_eq!(table(&heard).cells()[0].is_measuring(), is_measuring);
+    }
+}

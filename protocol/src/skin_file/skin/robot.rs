@@ -182,3 +182,33 @@ impl Chain {
         u8::try_from(moving.count()).unwrap_or(u8::MAX)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_transform_of_a_base_turns_its_axes_as_the_quaternion_says() {
+        let quarter = std::f64::consts::FRAC_1_SQRT_2;
+        let (x, y, z) = ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]);
+        let minus = |axis: [f64; 3]| axis.map(|it| -it);
+        for (orientation, images) in [
+            ([0.0, 0.0, 0.0, 1.0], [x, y, z]),
+            ([quarter, 0.0, 0.0, quarter], [x, z, minus(y)]),
+            ([0.0, quarter, 0.0, quarter], [minus(z), y, x]),
+            ([0.0, 0.0, quarter, quarter], [y, minus(x), z]),
+            // About the diagonal, by 120 degrees and back; the length does not count.
+            ([3.0, 3.0, 3.0, 3.0], [y, z, x]),
+            ([0.5, 0.5, 0.5, -0.5], [z, x, y]),
+        ] {
+            let position = [0.1, -0.2, 0.3];
+            let columns = ChainBase { position, orientation }.transform_matrix();
+            let expected = [images[0], images[1], images[2], position];
+            for ((column, expected), is_point) in columns.iter().zip(expected).zip([0.0, 0.0, 0.0, 1.0]) {
+                for (got, expected) in column.iter().zip([expected[0], expected[1], expected[2], is_point]) {
+                    assert!((got - expected).abs() < 1e-12, "{orientation:?}: {columns:?}");
+                }
+            }
+        }
+    }
+}

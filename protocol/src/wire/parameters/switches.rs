@@ -184,4 +184,16 @@ mod tests {
             assert_eq!(LinksDown::from_words([word, 0, 0, 0, 0, 0]).ports, deaf);
         }
     }
+
+    #[test]
+    fn events_come_back_from_their_words_unless_one_is_negative_or_the_hysteresis_above_1() {
+        let words = [1, 2, 3, 4, 1 << 14, 0];
+        let events = Events::from_words(words).unwrap();
+        assert_eq!((events.contact.to_bits(), events.temperature.to_bits(), events.words()), (1, 3, words));
+        for (at, word) in [(0, -1), (1, -1), (2, -1), (3, -1), (4, -1), (4, (1 << 14) + 1)] {
+            let mut unsound = words;
+            unsound[at] = word;
+            assert_eq!(Events::from_words(unsound), None, "{unsound:?}");
+        }
+    }
 }

@@ -108,4 +108,17 @@ mod tests {
         assert_eq!([0, 1].map(|joint| torques.element_unit(joint, units)), ["Nm", "N"]);
         assert_eq!([0, 1].map(|joint| torques.element_unit(joint, BusUnits::default())), ["Nm", "Nm"]);
     }
+
+    #[test]
+    #[expect(clippy::float_cmp, reason = "multiples of powers of two")]
+    fn a_raw_value_is_a_multiple_of_the_step_of_its_unit() {
+        let fields =
+            || packet_schemas().iter().flat_map(|packet| packet.layouts.iter().flat_map(|it| &it.fields));
+        let units = BusUnits { prismatic: 0b10, ..BusUnits::default() };
+        let torques = fields().find(|field| field.format == FieldFormat::Torque).unwrap();
+        assert_eq!([-4_096, 0, 2_048].map(|raw| torques.element_value(raw, 0, units)), [-1.0, 0.0, 0.5]);
+        let positions = fields().find(|field| field.format == FieldFormat::Position).unwrap();
+        let at = |joint| positions.element_value(1 << 14, joint, units);
+        assert_eq!([0, 1].map(at), [FRAC_PI_2, 1.0], "an angle in quarter turns, and m");
+    }
 }
