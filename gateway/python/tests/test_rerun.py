@@ -408,13 +408,20 @@ def test_torques_are_logged_while_central_ones_are_unknown(tmp_path: Path) -> No
 
 def test_a_closed_viewer_is_a_warning() -> None:
     class Closed:
+        is_connected = True
+
         def flush(self) -> None:
             raise RuntimeError("the sink is gone")
 
+        def disconnect(self) -> None:
+            self.is_connected = False
+
+    own = Closed()
     with pytest.warns(UserWarning, match="the viewer did not receive everything: the sink is gone"):
         finish(cast(Any, Closed()), is_own=False)
     with pytest.raises(RuntimeError, match="the sink is gone"):
-        finish(cast(Any, Closed()), is_own=True)
+        finish(cast(Any, own), is_own=True)
+    assert not own.is_connected
 
 
 @pytest.mark.parametrize("scale", [0.3, 1.0, 3.0])

@@ -20,14 +20,11 @@ from skinbus._programs import program_path
 from skinbus._rerun_topics import Log, Topics
 from skinbus._scene import Silence
 from skinbus.bench import Bench
-from skinbus.errors import CommandRefused, RunFailed, SkinbusError
-from skinbus.events import CellState, Contact, Epoch, Event
+from skinbus.errors import RunFailed, SkinbusError
+from skinbus.events import CellState, Contact, Event
 
-_NANOS = 1e-9
 # Time in seconds in which the program that follows the buses starts and ends.
 _VIEW_TIMEOUT = 30.0
-# Time in seconds to wait for the epoch that shows when the run began.
-_EPOCH_TIMEOUT = 2.0
 _SUBPROTOCOL = "foxglove.websocket.v1"
 _MESSAGE_DATA = 1
 
@@ -58,14 +55,16 @@ class LiveLog:
         self._stack = contextlib.ExitStack()
         recording = str(stream.get_recording_id())
         if recording not in _origins:
-            _origins[recording] = _first_tick_ns(bench)
+            _origins[recording] = time.time_ns()
             stream.send_recording_name(Path(bench.skin).name)
             stream.send_recording_start_time_nanos(_origins[recording])
         self._log = Log(stream, _origins[recording])
         # Two threads log what `close` ends.
         self._lock = threading.Lock()
         self._has_topics = self._has_events = True
-        self._is_closing = False
+        self._is_closing = self._is_closed = False
+        events = bench.events()
+        self._first_event = events[-1].index + 1 if events else 0
         self._view = _start_view(bench)
         try:
             self._socket = _connect(self._view, self._stack)
@@ -93,7 +92,7 @@ class LiveLog:
 
     def close(self) -> None:
         """Ends the log, and completes the file. Warns if the viewer was closed before."""
-        if self._is_closing:
+        if self._is_closed:
             return
         self._is_closing = True
         self._view.terminate()
@@ -103,12 +102,19 @@ class LiveLog:
             self._view.kill()
             self._view.wait()
         self._threads[0].join(_VIEW_TIMEOUT)
+        # In a thread of its own, because times of a stream belong to the thread that sets them.
+        ending = threading.Thread(target=self._end_log, name="skinbus end of log", daemon=True)
+        ending.start()
+        ending.join(_VIEW_TIMEOUT)
+        self._stack.close()
+        view.finish(self.stream, is_own=self._is_own)
+        self._is_closed = True
+
+    def _end_log(self) -> None:
         with self._lock:
             if self._has_events:
                 self._has_events = False
                 self._end("the log has ended")
-        self._stack.close()
-        view.finish(self.stream, is_own=self._is_own)
 
     def _end(self, text: str) -> None:
         """Logs an end. The caller holds the lock."""
@@ -163,14 +169,14 @@ class LiveLog:
                 with self._lock:
                     if not self._has_events:
                         return
-                    self._add_event(event, touched, silent)
+                    self._add_event(event, touched, silent, is_old=event.index < self._first_event)
         with self._lock:
             if self._has_events:
                 self._has_events = False
                 self._end("the bench has ended")
         self._view.terminate()
 
-    def _add_event(self, event: Event, touched: set[str], silent: set[str]) -> None:
+    def _add_event(self, event: Event, touched: set[str], silent: set[str], *, is_old: bool) -> None:
         if isinstance(event, Contact):
             change = "is touched" if event.touched else "is no longer touched"
             (touched.add if event.touched else touched.discard)(event.cell)
@@ -179,19 +185,10 @@ class LiveLog:
         elif isinstance(event, CellState) and (event.state == "dead") != (event.cell in silent):
             is_back = event.cell in silent
             (silent.discard if is_back else silent.add)(event.cell)
-            # The event has no time.
-            silence = Silence(time.time_ns(), event.cell, is_back)
-            self._log.add_event(silence.at_ns, silence.text)
-
-
-def _first_tick_ns(bench: Bench) -> int:
-    """Returns the time of the first tick by the number of the next epoch; the present time if none comes."""
-    try:
-        with bench._epochs() as start:
-            epoch = bench.wait_for(Epoch, start=start, timeout=_EPOCH_TIMEOUT)
-    except (TimeoutError, CommandRefused):
-        return time.time_ns()
-    return epoch.at_ns - round(epoch.number * bench.ready.period_s / _NANOS)
+            # The event has no time, so only those from now on are logged.
+            if not is_old:
+                silence = Silence(time.time_ns(), event.cell, is_back)
+                self._log.add_event(silence.at_ns, silence.text)
 
 
 def _start_view(bench: Bench) -> subprocess.Popen[str]:

@@ -179,8 +179,9 @@ def finish(stream: rr.RecordingStream, *, is_own: bool) -> None:
         if is_own:
             raise
         warnings.warn(f"the viewer did not receive everything: {error}", stacklevel=3)
-    if is_own:
-        stream.disconnect()
+    finally:
+        if is_own:
+            stream.disconnect()
 
 
 def unit_names(units: Units) -> tuple[str, str]:

@@ -312,7 +312,8 @@ class Bench:
     def torques(self) -> Torques:
         """Returns the torques of the robot's joints in Nm at the last complete epoch, each of shape (joints,).
 
-        `distributed` is the sum of the cells' torques, `central` the torque that the gateway computes for comparison.
+        `distributed` is the sum of the cells' torques, `central` the torque that the gateway computes for comparison;
+        it is empty while the sensors of a touched cell are unknown.
         """
         report = self.report()
         return Torques(report.distributed, report.central)

@@ -17,7 +17,10 @@ Id: TypeAlias = int | str | None
 
 
 class Torques(NamedTuple):
-    """Torques of the robot's joints in Nm, each of shape (joints,); empty before the first complete epoch."""
+    """Torques of the robot's joints in Nm, each of shape (joints,); empty before the first complete epoch.
+
+    `central` is also empty while the sensors of a touched cell are unknown.
+    """
 
     distributed: Vector
     central: Vector

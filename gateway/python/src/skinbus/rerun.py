@@ -18,8 +18,8 @@
 Central torques and differences have gaps while they are unknown, differences also while replies of cells are missing.
 When a bench or its log ends, its joints, torques and robot are cleared.
 
-The timeline `time` has the time in UTC, and `run` the time since the first tick of the run; of several benches in one
-recording, of the first.
+The timeline `time` has the time in UTC, and `run` the time since the first tick of a recorded run; of benches, the time
+since the log of the first one began.
 """
 
 from __future__ import annotations
