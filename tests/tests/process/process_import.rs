@@ -146,7 +146,7 @@ fn links_are_covered_and_the_skin_runs() {
     refused(
         &place,
         "run skin.toml --bus-kind embedded --record no.mcap",
-        "robot.urdf: arm.urdf:1: not XML: a URDF begins with <?xml or <robot; name the robot's URDF; correct the \
+        "robot.urdf: arm.urdf:1: not XML: a URDF begins with <?xml or <robot; give the path of the robot's URDF; correct the \
          path in the skin, or remove the key",
     );
     fs::remove_file(place.path("arm.urdf")).unwrap();
