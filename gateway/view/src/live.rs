@@ -270,7 +270,7 @@ impl LiveState {
     /// | 4 | cells, u32 |
     /// | 4 | 0: a snapshot |
     /// | 8 | seconds of the run, or since the first frame, f64 |
-    /// | 12 J | for each joint: position (rad or m), distributed and central torque (Nm or N), f32 |
+    /// | 12 J | for each joint: position (rad or m), distributed and central torque (Nm or N; central NaN while unknown), f32 |
     /// | 8 for each cell | status u8, flags u8, force mN u16, proximity 2^-15 u16, temperature 0.01 °C i16 |
     ///
     /// All values are little-endian. The torques are those of the last completed epoch. Status: 0 never heard, 1 quiet,

@@ -77,12 +77,13 @@ export function decodeCurves(buffer) {
   return { from, step, intervals, ranges: new Float32Array(buffer, 24, 2 * quantities * intervals) };
 }
 
-// A decoded quantity as points. Intervals without a value are left out, unless they follow each other for a second.
-export function points({ from, step, intervals, ranges }, quantity) {
+// A decoded quantity as points. Intervals without a value are left out, unless they follow each other for a second; where
+// the quantity `beside` has a value, this one is unknown, NaN.
+export function points({ from, step, intervals, ranges }, quantity, beside = quantity) {
   const all = [];
   for (let k = 0; k < intervals; k++) {
     const at = 2 * (quantity * intervals + k);
-    if (!Number.isNaN(ranges[at])) all.push(from + (k + 0.5) * step, ranges[at], ranges[at + 1]);
+    if (!Number.isNaN(ranges[2 * (beside * intervals + k)])) all.push(from + (k + 0.5) * step, ranges[at], ranges[at + 1]);
   }
   return all;
 }

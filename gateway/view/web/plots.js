@@ -194,7 +194,8 @@ export class Plots {
       const answer = this.recorded.part(`/curves?of=${of}`, from, to, count, fresh, async (response) => decodeCurves(await response.arrayBuffer()));
       if (!answer) return [];
       const quantity = what === "torque" ? 3 * lane.joint + (curve === 0 ? 1 : 0) : what === "difference" ? 3 * lane.joint + 2 : lane.bus ?? 0;
-      const all = points(answer, quantity);
+      // The cells' torque is known in each epoch.
+      const all = points(answer, quantity, what === "torque" || what === "difference" ? 3 * lane.joint : quantity);
       return what === "load" ? all.map((v, k) => (k % 3 ? v * 100 : v)) : all;
     }
     if (what === "torque") return this.torques.curve(2 * lane.joint + (curve === 0 ? 1 : 0), from, to, count);

@@ -82,6 +82,14 @@ test("curves of a recording are read as the server writes them", () => {
   assert.throws(() => decodeCurves(curves(2, 0.5, [[1, 2]]).slice(0, 30)));
   const all = points(it, 0);
   assert.deepEqual([valueAt(all, 2.3), valueAt(all, 3.3), valueAt(all, 9), valueAt([], 1)], [2, 4, null, null]);
+  // The central torque is unknown in the second interval, in which the cells sent one.
+  const two = new DataView(new ArrayBuffer(24 + 8 * 6));
+  [2, 3].forEach((v, k) => two.setUint32(4 * k, v, true));
+  [2, 0.5].forEach((v, k) => two.setFloat64(8 + 8 * k, v, true));
+  [7, 7, 8, 8, NaN, NaN, 1, 2, NaN, NaN, NaN, NaN].forEach((v, k) => two.setFloat32(24 + 4 * k, v, true));
+  const central = points(decodeCurves(two.buffer), 1, 0);
+  assert.deepEqual(central, [2.25, 1, 2, 2.75, NaN, NaN]);
+  assert.deepEqual([valueAt(central, 2.25, 0), valueAt(central, 2.75, 0.2)], [2, null]);
 });
 
 test("what is shown is asked for once, with some beside it, and again after a zoom", async () => {
