@@ -62,6 +62,13 @@ mod flag {
     pub(super) const STUCK_BIT: u8 = 32;
 }
 
+/// Removes the central torques if any of them is NaN: they are unknown, as without a central computation.
+pub(crate) fn clear_if_unknown(central: &mut Vec<f64>) {
+    if central.iter().any(|torque| torque.is_nan()) {
+        central.clear();
+    }
+}
+
 impl LiveState {
     /// Creates the state of a skin of which no frame has been received yet.
     #[must_use]

@@ -14,6 +14,7 @@ use super::event::{
 };
 use super::presses::{PendingPresses, Press, Unconfirmed};
 use crate::live::bus::{BroadcastJoints, LiveBus};
+use crate::live::clear_if_unknown;
 
 /// The maximum error of a cell's J in steps of 2^-14, for a chain of six rows (requirement J-3).
 const MAX_J_ERROR_STEPS: f64 = 8.0;
@@ -164,7 +165,7 @@ impl ControlBus {
             joints.distributed.push(distributed);
             joints.central.push(central);
         }
-        joints.clear_unknown_central();
+        clear_if_unknown(&mut joints.central);
         let (bus, epoch) = (self.name().to_owned(), ended.epoch.0);
         ControlEvent::Epoch { bus, epoch, number: self.number, at_ns, joints }
     }

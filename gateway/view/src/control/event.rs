@@ -206,15 +206,6 @@ pub struct JointTorques {
     pub central: Vec<f64>,
 }
 
-impl JointTorques {
-    /// Removes the central torques if any of them is NaN: they are unknown.
-    pub(super) fn clear_unknown_central(&mut self) {
-        if self.central.iter().any(|torque| torque.is_nan()) {
-            self.central.clear();
-        }
-    }
-}
-
 /// The state of a bus in a report.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ReportedBus {

@@ -16,6 +16,7 @@ use super::event::{AskedStimulus, ControlEvent, JointTorques, ReadyBus, Reported
 use super::presses::Press;
 use super::request::{InputLine, Request};
 use crate::command::{ControlCommand, DirectCommand, ResolvedCommand};
+use crate::live::clear_if_unknown;
 
 /// The maximum number of commands that the run carries out at once. It keeps more answers than that.
 const MAX_COMMANDS_IN_FLIGHT: usize = 4;
@@ -417,7 +418,7 @@ impl ControlState {
             all.distributed.clear();
             all.central.clear();
         }
-        all.clear_unknown_central();
+        clear_if_unknown(&mut all.central);
         let lateness_us = Some(lateness_us).filter(|lateness| lateness.count > 0);
         ControlEvent::Report { id, buses, joints: all, cells, lateness_us, skipped }
     }

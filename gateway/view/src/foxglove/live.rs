@@ -17,7 +17,7 @@ use trace::ros2::standard::{JointState, Point};
 
 use super::hub::HubSink;
 use super::server::FoxgloveServer;
-use crate::live::LiveState;
+use crate::live::{LiveState, clear_if_unknown};
 
 /// The interval between diagnostics messages, in µs.
 const DIAGNOSTICS_INTERVAL_US: u64 = 500_000;
@@ -105,10 +105,7 @@ impl LiveTopics {
         let column = |place: fn(&[f64; 3]) -> f64| joints.iter().map(place).collect::<Vec<_>>();
         let (position, effort) = (column(|[position, ..]| *position), column(|[_, effort, _]| *effort));
         let mut central = column(|[.., central]| *central);
-        if central.iter().any(|torque| torque.is_nan()) {
-            // Unknown, as in ticks without a central computation.
-            central.clear();
-        }
+        clear_if_unknown(&mut central);
         let names = &layout.joints;
         let state = JointState { nanos, names, position: &position, velocity: &[], effort: &effort };
         topics.write_joint_states(sink, &state);

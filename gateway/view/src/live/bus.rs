@@ -156,16 +156,13 @@ impl LiveBus {
     fn close_epoch(&mut self, at: Micros) {
         let Some(heard) = self.current else { return };
         let frames = self.central.link_frames(&heard.positions);
-        let is_unknown = |(sensors, status): (Option<SkinSensors>, CellStatus)| {
-            sensors.is_none() && matches!(status, CellStatus::Active | CellStatus::Stale)
-        };
-        let central = if self.table.presumed_sensors(at).any(is_unknown) {
-            [f64::NAN; MAX_JOINTS]
-        } else {
-            let cells = self.table.cells().iter();
-            let sensors: Vec<_> = cells.map(|cell| cell.presumed_sensors().unwrap_or_default()).collect();
-            self.central.total_torque(&frames, &sensors).torque
-        };
+        let cells = self.table.presumed_sensors(at).map(|(sensors, status)| {
+            let is_touched = matches!(status, CellStatus::Active | CellStatus::Stale);
+            sensors.or_else(|| (!is_touched).then(SkinSensors::default))
+        });
+        let sensors: Option<Vec<_>> = cells.collect();
+        let central = sensors
+            .map_or([f64::NAN; MAX_JOINTS], |sensors| self.central.total_torque(&frames, &sensors).torque);
         let distributed = self.table.snapshot().sums.torque;
         for ((torque, distributed), central) in self.torques.iter_mut().zip(distributed).zip(central) {
             *torque = (distributed, central);
