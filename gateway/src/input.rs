@@ -37,6 +37,16 @@ pub(crate) fn stop_flag() -> Result<Arc<AtomicBool>, Failure> {
     catch_signals(&[SIGINT, SIGTERM]).map_err(Failure::run_error)
 }
 
+/// Sets the stop flag when standard input ends.
+pub(crate) fn stop_after_input() -> io::Result<()> {
+    let wait = || {
+        // An input that cannot be read has ended, too.
+        let _ = io::copy(&mut io::stdin(), &mut io::sink());
+        stop::stop_flag().store(true, Ordering::Relaxed);
+    };
+    thread::Builder::new().name("end of input".to_owned()).spawn(wait).map(drop)
+}
+
 /// Returns true for the name of a capture, false for that of a bus.
 pub(crate) fn is_file(source: &Path) -> bool {
     is_standard_input(source) || source.exists()

@@ -27,7 +27,7 @@ use view::server::{PageAccess, page_url};
 use view::{RowMesh, Token};
 
 use super::arguments::{BusKinds, bus_names, find_bus, parse_address, parse_time_ns};
-use super::input::{no_frame_failure, note_skin_difference, read_skin, skin_of_recording, stop_flag};
+use super::input::{no_frame_failure, note_skin_difference, read_skin, skin_of_recording, stop_after_input, stop_flag};
 use super::output::print_note;
 use super::robot_file::{SkinRobot, urdf_path};
 use super::surface::robot_meshes;
@@ -94,6 +94,9 @@ pub(crate) struct ViewCommand {
     /// and states over the socket at standard output, and end with the run
     #[arg(long, hide = true)]
     of_run: bool,
+    /// End when standard input ends: the program that started this one may be killed
+    #[arg(long, hide = true, conflicts_with = "of_run")]
+    end_with_input: bool,
     #[command(flatten)]
     packages: PackageOptions,
     #[command(flatten)]
@@ -170,6 +173,9 @@ impl ViewCommand {
         let _file = of_file.map(|(path, url)| AddressFile::write(path, url)).transpose()?;
         let access = PageAccess { may_act, may_play: is_recording, token };
         let served = PageServer { listener, access, url, viewers };
+        if self.end_with_input {
+            stop_after_input().map_err(|error| view_failure(&error))?;
+        }
         if is_recording { self.serve_recording(served) } else { self.serve_live(served) }
     }
 

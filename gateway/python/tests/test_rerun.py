@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import signal
 import struct
 import subprocess
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -38,28 +40,34 @@ class Logged:
     def __init__(self, path: Path) -> None:
         from rerun.chunk import RrdReader
 
-        self._columns: dict[str, dict[str, list[Any]]] = {}
+        self._rows: dict[str, dict[str, list[tuple[int, int, Any]]]] = {}
         self._static: dict[str, dict[str, list[Any]]] = {}
         self.chunks = Counter[str]()
         for chunk in RrdReader(path).stream():
             batch = chunk.to_record_batch()
             self.chunks[chunk.entity_path] += 1
-            every = self._static if chunk.is_static else self._columns
-            columns = every.setdefault(chunk.entity_path, {})
+            # Times in ns have no equal in Python.
+            times = {
+                name: batch.column(name).cast("int64").to_pylist()
+                for name in batch.schema.names
+                if name in ("time", "run")
+            }
             for name in batch.schema.names:
-                column = batch.column(name)
-                # Times in ns have no equal in Python.
-                values = column.cast("int64") if name in ("time", "run", "log_time") else column
-                columns.setdefault(name, []).extend(values.to_pylist())
-            # A component that a chunk does not have has no values at its times.
-            count = max(map(len, columns.values()), default=0)
-            for values in columns.values():
-                values.extend([None] * (count - len(values)))
+                # Other columns have no component, such as times and row ids.
+                if ":" not in name:
+                    continue
+                values = batch.column(name)
+                if chunk.is_static:
+                    self._static.setdefault(chunk.entity_path, {}).setdefault(name, []).extend(values.to_pylist())
+                    continue
+                rows = zip(times["time"], times["run"], values.to_pylist(), strict=True)
+                components = self._rows.setdefault(chunk.entity_path, {})
+                components.setdefault(name, []).extend(row for row in rows if row[2] is not None)
 
     @property
     def entities(self) -> set[str]:
         """The entities with values that change."""
-        return set(self._columns)
+        return set(self._rows)
 
     @property
     def static(self) -> set[str]:
@@ -71,20 +79,35 @@ class Logged:
         return self._static[entity][component]
 
     def times(self, entity: str) -> NDArray[np.int64]:
-        """Returns the times of an entity in ns since 1970."""
-        return np.array(self._columns[entity]["time"], np.int64)
+        """Returns the times of an entity in ns since 1970, without those at which it is cleared."""
+        return np.array([at_ns for at_ns, _, _ in self._first_rows(entity)], np.int64)
 
     def runs(self, entity: str) -> NDArray[np.int64]:
-        """Returns the times of an entity in ns since the beginning of the run."""
-        return np.array(self._columns[entity]["run"], np.int64)
+        """Returns the same times in ns since the beginning of the run."""
+        return np.array([run_ns for _, run_ns, _ in self._first_rows(entity)], np.int64)
+
+    def cleared_at(self, entity: str) -> int:
+        """Returns the last time in ns since 1970 at which an entity and all below it are cleared."""
+        at_ns, _, is_recursive = self._rows[entity]["Clear:is_recursive"][-1]
+        assert is_recursive == [True]
+        return at_ns
+
+    def _first_rows(self, entity: str) -> list[tuple[int, int, Any]]:
+        """Returns the rows of the first component."""
+        return next(rows for name, rows in self._rows[entity].items() if not name.startswith("Clear:"))
 
     def values(self, entity: str, component: str) -> list[Any]:
         """Returns the values of a component, one list of instances for each time."""
-        return self._columns[entity][component]
+        return [value for _, _, value in self._rows[entity][component]]
+
+    def shown(self, entity: str, component: str, at_ns: np.int64) -> Any:
+        """Returns what a viewer shows of a component at a time: the last value until then."""
+        return max((row for row in self._rows[entity][component] if row[0] <= at_ns), key=lambda row: row[0])[2]
 
     def scalars(self, entity: str) -> NDArray[np.float64]:
-        """Returns the only scalar at each time."""
-        return np.array([one[0] for one in self.values(entity, "Scalars:scalars") if one], np.float64)
+        """Returns the scalars of all times: [n] of entities with one series, otherwise [n, series]."""
+        scalars = np.array(self.values(entity, "Scalars:scalars"), np.float64)
+        return scalars[:, 0] if scalars.shape[1] == 1 else scalars
 
 
 @pytest.fixture(scope="module")
@@ -109,15 +132,14 @@ def test_the_series_are_those_of_read(demo: Path, logged: Logged) -> None:
     with skinbus.read(demo) as recording:
         epochs = recording.epochs()
         assert len(epochs) > 30
-        for at, name in enumerate(recording.joint_names):
-            for entity, expected in (
-                (f"/joints/{name}", epochs.positions),
-                (f"/torques/{name}/distributed", epochs.distributed),
-                (f"/torques/{name}/central", epochs.central),
-                (f"/torques/{name}/difference", np.where(epochs.open_cells[:, np.newaxis] > 0, np.nan, epochs.error)),
-            ):
-                np.testing.assert_array_equal(logged.times(entity), epochs.at_ns)
-                np.testing.assert_array_equal(logged.scalars(entity), expected[:, at])
+        for entity, expected in (
+            ("/joints", epochs.positions),
+            ("/torques/distributed", epochs.distributed),
+            ("/torques/central", epochs.central),
+            ("/torques/difference", np.where(epochs.open_cells[:, np.newaxis] > 0, np.nan, epochs.error)),
+        ):
+            np.testing.assert_array_equal(logged.times(entity), epochs.at_ns)
+            np.testing.assert_array_equal(logged.scalars(entity), expected)
 
 
 def test_contacts_are_those_of_read(demo: Path, logged: Logged) -> None:
@@ -179,6 +201,11 @@ def test_cells_have_names_and_forces(demo: Path, logged: Logged) -> None:
     assert {label.split(", ")[0] for label in labels} == names
     assert all(re.fullmatch(r"\S+, (\d+\.\d\d N|force unknown|silent)", label) for label in labels)
     assert all(logged.static_values(entity, "Points3D:show_labels") == [[False]] for entity in patches)
+    # Only changes are sent.
+    for entity in patches:
+        sent = logged.values(entity, "Points3D:labels")
+        assert 1 <= len(sent) < len(logged.times(entity))
+        assert all(before != after for before, after in itertools.pairwise(sent))
 
 
 def test_a_recording_has_a_name_and_a_beginning(demo: Path, logged: Logged) -> None:
@@ -188,14 +215,12 @@ def test_a_recording_has_a_name_and_a_beginning(demo: Path, logged: Logged) -> N
 
 
 def test_a_joint_has_one_colour_and_its_name_in_all_views(logged: Logged) -> None:
-    colors = set()
-    for at in range(1, 7):
-        name = f"joint{at}"
-        entities = [f"/joints/{name}", f"/torques/{name}/distributed", f"/torques/{name}/difference"]
-        assert all(logged.static_values(entity, "SeriesLines:names") == [[name]] for entity in entities)
-        (color,) = {logged.static_values(entity, "SeriesLines:colors")[0][0] for entity in entities}
-        colors.add(color)
-    assert len(colors) == 6
+    names = [f"joint{at}" for at in range(1, 7)]
+    entities = ["/joints", "/torques/distributed", "/torques/difference"]
+    assert all(logged.static_values(entity, "SeriesLines:names") == [names] for entity in entities)
+    every = [logged.static_values(entity, "SeriesLines:colors")[0] for entity in entities]
+    assert len(set(every[0])) == 6
+    assert every[1:] == every[:-1]
 
 
 @pytest.fixture(scope="module")
@@ -225,14 +250,14 @@ def assert_cell_is_silent_and_back(logged: Logged) -> None:
     silent = 0
     for entity in logged.entities:
         if entity.startswith("/robot/cells/"):
-            colors, labels = (logged.values(entity, f"Points3D:{name}") for name in ("colors", "labels"))
-            arrows = logged.values(entity.replace("/cells/", "/forces/"), "Arrows3D:vectors")
-            for shown, named, vectors in zip(colors, labels, arrows, strict=True):
-                if shown is None or DEAD not in shown:
+            forces = entity.replace("/cells/", "/forces/")
+            for at_ns, shown in zip(logged.times(entity), logged.values(entity, "Points3D:colors"), strict=True):
+                if DEAD not in shown:
                     continue
                 silent += 1
-                assert named[shown.index(DEAD)] == "vcan0:12, silent"
-                assert not vectors
+                labels = logged.shown(entity, "Points3D:labels", at_ns)
+                assert labels[shown.index(DEAD)] == "vcan0:12, silent"
+                assert not logged.shown(forces, "Arrows3D:vectors", at_ns)
     assert silent > 3
 
 
@@ -245,7 +270,7 @@ def test_a_silent_cell_looks_silent(faulty: Path, tmp_path: Path) -> None:
         is_open = np.asarray(epochs.open_cells) > 0
         assert is_open.any()
         assert not np.isnan(epochs.error[is_open]).all()
-        shown = logged.scalars("/torques/joint1/difference")
+        shown = logged.scalars("/torques/difference")[:, 0]
         assert np.isnan(shown[is_open]).all()
         assert not np.isnan(shown[~is_open]).all()
 
@@ -255,8 +280,7 @@ def test_a_log_has_series_and_parts_are_one_recording(tmp_path: Path) -> None:
     skinbus.to_rerun(*parts, save=tmp_path / "split.rrd")
     with skinbus.read(*parts, index=False) as recording:
         split = Logged(tmp_path / "split.rrd")
-        name = recording.joint_names[0]
-        np.testing.assert_array_equal(split.scalars(f"/joints/{name}"), recording.epochs().positions[:, 0])
+        np.testing.assert_array_equal(split.scalars("/joints"), recording.epochs().positions)
     assert any(entity.startswith("/robot/cells/") for entity in split.entities)
 
 
@@ -288,30 +312,30 @@ def test_a_bench_is_logged_while_it_runs(live: tuple[Path, str]) -> None:
         "the log has ended",
     ]
     # The run began before the log.
-    times = logged.runs("/joints/joint1")
+    times = logged.runs("/joints")
     assert 0 < times[0] < 60e9
-    np.testing.assert_array_equal(np.diff(times), np.diff(logged.times("/joints/joint1")))
+    np.testing.assert_array_equal(np.diff(times), np.diff(logged.times("/joints")))
     assert_is_cleared(logged)
-    joints = {entity for entity in logged.entities if entity.startswith("/joints/")}
-    assert len(joints) == 6
-    assert all(len(logged.scalars(entity)) > 30 for entity in joints)
+    assert logged.scalars("/joints").shape == (len(times), 6)
+    assert len(times) > 30
     forces = [entity for entity in logged.entities if entity.startswith("/robot/forces/")]
     arrows = [vectors for entity in forces for vectors in logged.values(entity, "Arrows3D:vectors") if vectors]
+    # Sent together: a chunk holds several clouds.
+    cells = [entity for entity in logged.entities if entity.startswith("/robot/")]
+    assert all(3 * logged.chunks[entity] < 2 * len(logged.times(entity)) for entity in [*cells, "/robot/links"])
     # 4 N, at 0.02 m for each N.
     assert arrows
     np.testing.assert_allclose([np.linalg.norm(vectors[0]) for vectors in arrows], 0.08, rtol=1e-2)
-    distributed = [logged.scalars(entity) for entity in logged.entities if entity.endswith("/distributed")]
-    assert max(float(np.nanmax(np.abs(values))) for values in distributed) > 0.1
+    assert np.nanmax(np.abs(logged.scalars("/torques/distributed"))) > 0.1
 
 
 def assert_is_cleared(logged: Logged) -> None:
     """Nothing stands as current at the end, and no line leads on."""
-    for entity in ("/torques", "/joints", "/robot"):
-        assert logged.values(entity, "Clear:is_recursive")[-1] == [True]
-    for entity in logged.entities:
-        if entity.startswith(("/joints/", "/torques/")):
-            assert np.isnan(logged.scalars(entity)[-1])
-            assert logged.times(entity)[-1] == logged.times("/joints")[-1]
+    ends = {logged.cleared_at(entity) for entity in ("/torques", "/joints", "/robot")}
+    assert len(ends) == 1
+    for entity in ("/joints", "/torques/distributed", "/torques/central", "/torques/difference"):
+        assert np.isnan(logged.scalars(entity)[-1]).all()
+        assert {logged.times(entity)[-1]} == ends
 
 
 @pytest.fixture
@@ -359,13 +383,31 @@ def test_a_killed_view_leaves_nothing_that_looks_current(live_bench: tuple[skinb
     assert_is_cleared(logged)
 
 
+def test_a_killed_script_leaves_no_view(tmp_path: Path) -> None:
+    script = f"""
+import time, skinbus
+with skinbus.Bench({str(SKIN)!r}) as bench, skinbus.to_rerun(bench, save={str(tmp_path / "live.rrd")!r}) as log:
+    print(log._view.pid, flush=True)
+    time.sleep(60)
+"""
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as started:
+        assert started.stdout is not None
+        view = Path("/proc", started.stdout.readline().strip())
+        assert view.exists()
+        started.kill()
+    deadline = time.monotonic() + 20.0
+    while view.exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not view.exists()
+
+
 def test_a_silent_cell_looks_silent_while_a_bench_runs(tmp_path: Path) -> None:
     path = tmp_path / "live.rrd"
     with skinbus.Bench(SKIN) as bench, skinbus.to_rerun(bench, save=path):
         cell_dies_and_is_back(bench)
     logged = Logged(path)
     assert_cell_is_silent_and_back(logged)
-    assert np.isnan(logged.scalars("/torques/joint1/difference")[:-1]).any()
+    assert np.isnan(logged.scalars("/torques/difference")[:, 0][:-1]).any()
 
 
 def test_a_second_bench_does_not_restart_the_timeline(tmp_path: Path) -> None:
@@ -377,9 +419,9 @@ def test_a_second_bench_does_not_restart_the_timeline(tmp_path: Path) -> None:
             bench.wait_epochs(30)
     stream.disconnect()
     logged = Logged(path)
-    times = logged.runs("/joints/joint1")
-    np.testing.assert_array_equal(np.diff(times), np.diff(logged.times("/joints/joint1")))
-    assert np.count_nonzero(np.isnan(logged.scalars("/joints/joint1"))) == 2
+    times = logged.runs("/joints")
+    np.testing.assert_array_equal(np.diff(times), np.diff(logged.times("/joints")))
+    assert np.count_nonzero(np.isnan(logged.scalars("/joints")[:, 0])) == 2
 
 
 def torques(distributed: list[float], central: list[float]) -> bytes:
@@ -392,15 +434,17 @@ def torques(distributed: list[float], central: list[float]) -> bytes:
 def test_torques_are_logged_while_central_ones_are_unknown(tmp_path: Path) -> None:
     stream = rr.RecordingStream("torques")
     stream.save(tmp_path / "torques.rrd")
-    topics = Topics(Log(stream, 1_000_000_000), ["a", "b"], {("a", "b")})
+    log = Log(stream, 1_000_000_000)
+    topics = Topics(log, ["a", "b"], {("a", "b")})
     topics.add("/arm/torques", torques([1.0, 2.0], []), [])
     topics.add("/arm/torques", torques([1.0, 2.0], [0.5, 0.5]), [])
+    log.set_time(2_000_000_000)
     topics.end(2_000_000_000)
     stream.disconnect()
     logged, unknown = Logged(tmp_path / "torques.rrd"), float("nan")
     for series, expected in (("distributed", [2.0, 2.0]), ("central", [unknown, 0.5]), ("difference", [unknown, 1.5])):
-        entity = f"/torques/b/{series}"
-        np.testing.assert_array_equal(logged.scalars(entity), [*expected, unknown])
+        entity = f"/torques/{series}"
+        np.testing.assert_array_equal(logged.scalars(entity)[:, 1], [*expected, unknown])
         assert logged.runs(entity).tolist() == [500_000_000, 500_000_000, 1_000_000_000]
         # Sent together.
         assert logged.chunks[entity] <= 2

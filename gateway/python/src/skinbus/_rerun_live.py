@@ -25,6 +25,8 @@ from skinbus.events import CellState, Contact, Event
 
 # Time in seconds in which the program that follows the buses starts and ends.
 _VIEW_TIMEOUT = 30.0
+# Time in seconds without a message after which everything that waits for later ones is sent.
+_PAUSE = 0.2
 _SUBPROTOCOL = "foxglove.websocket.v1"
 _MESSAGE_DATA = 1
 
@@ -132,7 +134,13 @@ class LiveLog:
         try:
             with contextlib.suppress(ConnectionClosed):
                 while True:
-                    said = self._socket.recv()
+                    try:
+                        said = self._socket.recv(_PAUSE)
+                    except TimeoutError:
+                        with self._lock:
+                            if self._has_topics:
+                                self._topics.send()
+                        continue
                     if isinstance(said, str):
                         self._subscribe(json.loads(said))
                     elif said[0] == _MESSAGE_DATA:
@@ -200,8 +208,14 @@ def _start_view(bench: Bench) -> subprocess.Popen[str]:
     environment.pop("SKINBUS_TOKEN", None)
     kinds = [f"--bus-kind={one.bus}={one.kind}" for one in bench.ready.buses]
     command = [str(program_path("skinbus")), "view", bench.skin, "--read-only", "--foxglove", "0", *kinds]
+    # The program ends with this one, whose end of the pipe is closed then.
     return subprocess.Popen(
-        command, env=environment, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True
+        [*command, "--end-with-input"],
+        env=environment,
+        stdin=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
     )
 
 

@@ -11,7 +11,7 @@ import rerun as rr
 from mcap.reader import make_reader
 
 from skinbus import _rerun_view as view
-from skinbus._rerun_view import entity_path, time_columns
+from skinbus._rerun_view import time_columns
 from skinbus._scene import Cells, Link, Scene, Silence
 from skinbus.recording import Recording
 
@@ -37,7 +37,7 @@ def log_recording(stream: rr.RecordingStream, recorded: Recording, paths: Sequen
     _log_moments(stream, moments, recorded.began_ns)
     clouds = [cells for cells_of_patch in moments.clouds.values() for cells in cells_of_patch]
     eye = view.eye(clouds, [link for links in moments.links.values() for link in links])
-    view.send_view(stream, recorded.joint_names, recorded.joint_units, eye=eye, duration=duration)
+    view.send_view(stream, recorded.joint_units, eye=eye, duration=duration)
 
 
 def _log_epochs(stream: rr.RecordingStream, recorded: Recording) -> float:
@@ -46,17 +46,15 @@ def _log_epochs(stream: rr.RecordingStream, recorded: Recording) -> float:
     There is no difference in epochs with missing replies: it would show their torques, not an error of computation.
     """
     epochs = recorded.epochs()
-    times = time_columns(np.array(epochs.at_ns), recorded.began_ns)
     differences = np.where(np.asarray(epochs.open_cells)[:, np.newaxis] > 0, np.nan, epochs.error)
     view.log_series_style(stream, epochs.names)
-    for at, name in enumerate(epochs.names):
-        for path, values in (
-            (entity_path("joints", name), epochs.positions),
-            (entity_path("torques", name, "distributed"), epochs.distributed),
-            (entity_path("torques", name, "central"), epochs.central),
-            (entity_path("torques", name, "difference"), differences),
-        ):
-            stream.send_columns(path, indexes=times, columns=rr.Scalars.columns(scalars=np.array(values[:, at])))
+    for entity, values in (
+        (view.POSITIONS, epochs.positions),
+        (view.DISTRIBUTED, epochs.distributed),
+        (view.CENTRAL, epochs.central),
+        (view.DIFFERENCE, differences),
+    ):
+        view.send_series(stream, recorded.began_ns, entity, np.array(epochs.at_ns), np.array(values))
     return (int(epochs.at_ns[-1]) - recorded.began_ns) * _NANOS if len(epochs) else 1.0
 
 
@@ -91,28 +89,10 @@ def _log_contacts(stream: rr.RecordingStream, recorded: Recording, silences: Seq
 def _log_moments(stream: rr.RecordingStream, moments: _Moments, began_ns: int) -> None:
     """Logs links, cells and forces."""
     view.log_robot_style(stream)
-    for patch, clouds in moments.clouds.items():
+    for clouds in moments.clouds.values():
         view.log_patch_style(stream, clouds[0])
-        times = time_columns((cells.at_ns for cells in clouds), began_ns)
-        points = rr.Points3D.columns(
-            positions=np.concatenate([cells.positions for cells in clouds]),
-            colors=np.concatenate([cells.colors for cells in clouds]),
-            labels=[label for cells in clouds for label in cells.labels],
-        )
-        counts = [len(cells.positions) for cells in clouds]
-        stream.send_columns(entity_path("robot", "cells", patch), indexes=times, columns=points.partition(counts))
-        arrows = rr.Arrows3D.columns(
-            origins=np.concatenate([cells.arrow_origins for cells in clouds]),
-            vectors=np.concatenate([cells.arrow_vectors for cells in clouds]),
-        )
-        counts = [len(cells.arrow_vectors) for cells in clouds]
-        stream.send_columns(entity_path("robot", "forces", patch), indexes=times, columns=arrows.partition(counts))
-    drawn = {at: links for at, links in sorted(moments.links.items()) if links}
-    if drawn:
-        every = [link for links in drawn.values() for link in links]
-        strips = rr.LineStrips3D.columns(strips=[link.points for link in every], radii=[link.radius for link in every])
-        strips = strips.partition([len(links) for links in drawn.values()])
-        stream.send_columns("/robot/links", indexes=time_columns(drawn, began_ns), columns=strips)
+        view.send_clouds(stream, began_ns, clouds, labels=None)
+    view.send_links(stream, began_ns, moments.links)
 
 
 def _moments(paths: Sequence[Path]) -> _Moments:

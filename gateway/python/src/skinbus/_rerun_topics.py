@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import rerun as rr
 
 from skinbus import _rerun_view as view
 from skinbus import _ros2
-from skinbus._rerun_view import entity_path, time_columns
-from skinbus._scene import Cells, Scene
+from skinbus._rerun_view import Floats
+from skinbus._scene import Cells, Link, Scene
 
-# Values of series are sent together after this time in ns: a chunk for each value would slow the viewer down.
+# Messages within this time in ns are sent together: Rerun's viewer takes in few chunks in each of its frames, so it
+# would lag behind with a chunk for each message.
 _BATCH_NS = 200_000_000
 # Time in ns after which the views are sent even if cells of a patch are missing.
 _SCENE_TIMEOUT_NS = 2_000_000_000
@@ -37,39 +38,64 @@ class Log:
         self.stream.log("/contacts", rr.TextLog(view.event_text(at_ns, self.began_ns, text)))
 
 
-class _Series:
-    """Values of series that are sent together."""
+class _Batch:
+    """Values, cells and links that are sent together."""
 
-    def __init__(self, log: Log) -> None:
+    def __init__(self, log: Log, joints: int) -> None:
         self._log = log
+        self._unknown = np.full(joints, np.nan)
         self._oldest_ns: int | None = None
-        self._rows: dict[str, tuple[list[int], list[float]]] = {}
+        self._series: dict[str, tuple[list[int], list[Floats]]] = {}
+        self._clouds: dict[str, list[Cells]] = {}
+        self._links: dict[int, list[Link]] = {}
+        # The labels that the stream has, by patch.
+        self._labels: dict[str, list[str]] = {}
 
-    def add(self, at_ns: int, values: Iterable[tuple[str, float]]) -> None:
-        """Adds a value of some series at a time. Sends all of them if the oldest has waited long enough."""
-        for path, value in values:
-            row = self._rows.setdefault(path, ([], []))
-            row[0].append(at_ns)
-            row[1].append(value)
+    def add_values(self, at_ns: int, entity: str, values: Floats) -> None:
+        """Adds the values of all joints at a time."""
+        times, rows = self._series.setdefault(entity, ([], []))
+        times.append(at_ns)
+        rows.append(values)
+        self._add_time(at_ns)
+
+    def add_cells(self, cells: Cells, scene: Scene) -> None:
+        """Adds the cells of a patch, and the links at the same time."""
+        self._clouds.setdefault(cells.patch, []).append(cells)
+        if cells.at_ns not in self._links:
+            self._links[cells.at_ns] = scene.links()
+        self._add_time(cells.at_ns)
+
+    def end(self, at_ns: int) -> None:
+        """Ends the lines of all series, so that none reaches to the values of a later bench, and sends everything."""
+        for times, rows in self._series.values():
+            times.append(at_ns)
+            rows.append(self._unknown)
+        self._log.last_ns = max(self._log.last_ns, at_ns)
+        self.send()
+
+    def send(self) -> None:
+        """Sends everything that waits."""
+        stream, began_ns = self._log.stream, self._log.began_ns
+        for entity, (times, rows) in self._series.items():
+            if times:
+                view.send_series(stream, began_ns, entity, times, np.array(rows))
+                times.clear()
+                rows.clear()
+        for patch, clouds in self._clouds.items():
+            view.send_clouds(stream, began_ns, clouds, self._labels.get(patch))
+            self._labels[patch] = clouds[-1].labels
+        self._clouds.clear()
+        view.send_links(stream, began_ns, self._links)
+        self._links.clear()
+        self._oldest_ns = None
+
+    def _add_time(self, at_ns: int) -> None:
+        """Sends everything if the oldest has waited long enough."""
         self._log.last_ns = max(self._log.last_ns, at_ns)
         if self._oldest_ns is None:
             self._oldest_ns = at_ns
         elif at_ns - self._oldest_ns >= _BATCH_NS:
-            self._send()
-
-    def end(self, at_ns: int) -> None:
-        """Ends the lines of all series, so that none reaches to the values of a later bench."""
-        self.add(at_ns, [(path, float("nan")) for path in self._rows])
-        self._send()
-
-    def _send(self) -> None:
-        for path, (times, values) in self._rows.items():
-            if times:
-                columns = rr.Scalars.columns(scalars=values)
-                self._log.stream.send_columns(path, indexes=time_columns(times, self._log.began_ns), columns=columns)
-                times.clear()
-                values.clear()
-        self._oldest_ns = None
+            self.send()
 
 
 class Topics:
@@ -79,10 +105,9 @@ class Topics:
         self._log = log
         self._joints = tuple(joints)
         self._viewed = viewed
-        self._series = _Series(log)
+        self._batch = _Batch(log, len(joints))
         self._scene = Scene()
         self._first: dict[str, Cells] = {}
-        self._links_ns = 0
         self._units: list[tuple[str, str]] = []
         view.log_robot_style(log.stream)
         view.log_series_style(log.stream, joints)
@@ -94,8 +119,9 @@ class Topics:
                 self._units = [("rad", "Nm")] * len(self._joints)
         elif topic.endswith("/joint_states"):
             state = _ros2.joint_state(message)
-            paths = [entity_path("joints", name) for name in state.names]
-            self._series.add(state.at_ns, zip(paths, state.positions.tolist(), strict=False))
+            of_joint = dict(zip(state.names, state.positions.tolist(), strict=False))
+            positions = np.array([of_joint.get(name, np.nan) for name in self._joints])
+            self._batch.add_values(state.at_ns, view.POSITIONS, positions)
         elif topic.endswith("/torques"):
             self._add_torques(_ros2.torques(message))
         else:
@@ -105,11 +131,15 @@ class Topics:
         if self._joints not in self._viewed and self._is_complete(topics):
             self._viewed.add(self._joints)
             eye = view.eye(self._first.values(), self._scene.links(), is_live=True)
-            view.send_view(self._log.stream, self._joints, self._units, eye=eye, duration=None)
+            view.send_view(self._log.stream, self._units, eye=eye, duration=None)
+
+    def send(self) -> None:
+        """Sends everything that waits for later messages."""
+        self._batch.send()
 
     def end(self, at_ns: int) -> None:
         """Ends the series, and clears what would stand as current. The time of the log is set."""
-        self._series.end(at_ns)
+        self._batch.end(at_ns)
         for entity in ("/torques", "/joints", "/robot"):
             self._log.stream.log(entity, rr.Clear(recursive=True))
 
@@ -126,25 +156,15 @@ class Topics:
         unknown = np.full(len(torques.distributed), np.nan)
         central = torques.central if len(torques.central) else unknown
         difference = unknown if self._scene.is_incomplete else torques.distributed - central
-        values = {"distributed": torques.distributed, "central": central, "difference": difference}
-        for series, each in values.items():
-            paths = [entity_path("torques", name, series) for name in self._joints]
-            self._series.add(torques.at_ns, zip(paths, each.tolist(), strict=False))
+        for entity, values in (
+            (view.DISTRIBUTED, torques.distributed),
+            (view.CENTRAL, central),
+            (view.DIFFERENCE, difference),
+        ):
+            self._batch.add_values(torques.at_ns, entity, values)
 
     def _add_cells(self, cells: Cells) -> None:
-        stream = self._log.stream
         if cells.patch not in self._first:
             self._first[cells.patch] = cells
-            view.log_patch_style(stream, cells)
-        self._log.set_time(cells.at_ns)
-        points = rr.Points3D.from_fields(positions=cells.positions, colors=cells.colors, labels=cells.labels)
-        stream.log(entity_path("robot", "cells", cells.patch), points)
-        arrows = rr.Arrows3D.from_fields(origins=cells.arrow_origins, vectors=cells.arrow_vectors)
-        stream.log(entity_path("robot", "forces", cells.patch), arrows)
-        if cells.at_ns != self._links_ns:
-            self._links_ns = cells.at_ns
-            links = self._scene.links()
-            strips = rr.LineStrips3D.from_fields(
-                strips=[link.points for link in links], radii=[link.radius for link in links]
-            )
-            stream.log("/robot/links", strips)
+            view.log_patch_style(self._log.stream, cells)
+        self._batch.add_cells(cells, self._scene)

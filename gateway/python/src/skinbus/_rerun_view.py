@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import rerun as rr
@@ -16,6 +16,11 @@ from skinbus._scene import Cells, Link
 
 Floats = NDArray[np.float64]
 Units = Sequence[tuple[str, str]]
+
+# Entities of series. Each has a value for each joint, because a viewer spends its time on each entity.
+POSITIONS, DISTRIBUTED, CENTRAL, DIFFERENCE = (
+    "/joints", "/torques/distributed", "/torques/central", "/torques/difference",
+)  # fmt: skip
 
 _LINK_COLOR = (82, 86, 92)
 _ARROW_COLOR = (230, 60, 60)
@@ -62,18 +67,68 @@ def log_patch_style(stream: rr.RecordingStream, cells: Cells) -> None:
     stream.log(entity_path("robot", "forces", cells.patch), arrows, static=True)
 
 
+def send_clouds(stream: rr.RecordingStream, began_ns: int, clouds: Sequence[Cells], labels: list[str] | None) -> None:
+    """Sends cells and forces of a patch at all its times. Labels are sent when they change, because they are large.
+
+    Args:
+        stream: The stream.
+        began_ns: The time in ns since 1970 at which the timeline "run" begins.
+        clouds: The cells by time; at least one.
+        labels: The labels that the stream has; None if it has none.
+    """
+    times, patch = time_columns([cells.at_ns for cells in clouds], began_ns), clouds[0].patch
+    cells_entity = entity_path("robot", "cells", patch)
+    points = rr.Points3D.columns(
+        positions=np.concatenate([cells.positions for cells in clouds]),
+        colors=np.concatenate([cells.colors for cells in clouds]),
+    )
+    points = points.partition([len(cells.positions) for cells in clouds])
+    stream.send_columns(cells_entity, indexes=times, columns=points)
+    before = [labels, *(cells.labels for cells in clouds)]
+    changed = [cells for cells, last in zip(clouds, before, strict=False) if cells.labels != last]
+    if changed:
+        texts = rr.Points3D.columns(labels=[label for cells in changed for label in cells.labels])
+        changes = time_columns([cells.at_ns for cells in changed], began_ns)
+        texts = texts.partition([len(cells.labels) for cells in changed])
+        stream.send_columns(cells_entity, indexes=changes, columns=texts)
+    arrows = rr.Arrows3D.columns(
+        origins=np.concatenate([cells.arrow_origins for cells in clouds]),
+        vectors=np.concatenate([cells.arrow_vectors for cells in clouds]),
+    )
+    arrows = arrows.partition([len(cells.arrow_vectors) for cells in clouds])
+    stream.send_columns(entity_path("robot", "forces", patch), indexes=times, columns=arrows)
+
+
+def send_links(stream: rr.RecordingStream, began_ns: int, links: Mapping[int, Sequence[Link]]) -> None:
+    """Sends the links at all their times in ns since 1970."""
+    drawn = {at_ns: at_once for at_ns, at_once in sorted(links.items()) if at_once}
+    if drawn:
+        every = [link for at_once in drawn.values() for link in at_once]
+        strips = rr.LineStrips3D.columns(strips=[link.points for link in every], radii=[link.radius for link in every])
+        strips = strips.partition([len(at_once) for at_once in drawn.values()])
+        stream.send_columns("/robot/links", indexes=time_columns(drawn, began_ns), columns=strips)
+
+
 def log_series_style(stream: rr.RecordingStream, joints: Sequence[str]) -> None:
     """Logs names and colours of series: a joint has one colour in all views."""
-    for at, joint in enumerate(joints):
-        color = _JOINT_COLORS[at % len(_JOINT_COLORS)]
-        pale = tuple(int(0.5 * part + 110) for part in color)
-        for path, style in (
-            (("joints", joint), rr.SeriesLines(names=joint, colors=color)),
-            (("torques", joint, "distributed"), rr.SeriesLines(names=joint, colors=color, widths=2)),
-            (("torques", joint, "central"), rr.SeriesLines(names=f"{joint} central", colors=pale, widths=1)),
-            (("torques", joint, "difference"), rr.SeriesLines(names=joint, colors=color)),
-        ):
-            stream.log(entity_path(*path), style, static=True)
+    colors = [_JOINT_COLORS[at % len(_JOINT_COLORS)] for at in range(len(joints))]
+    pale = [tuple(int(0.5 * part + 110) for part in color) for color in colors]
+    central = [f"{joint} central" for joint in joints]
+    for entity, style in (
+        (POSITIONS, rr.SeriesLines(names=joints, colors=colors)),
+        (DISTRIBUTED, rr.SeriesLines(names=joints, colors=colors, widths=[2] * len(joints))),
+        (CENTRAL, rr.SeriesLines(names=central, colors=pale, widths=[1] * len(joints))),
+        (DIFFERENCE, rr.SeriesLines(names=joints, colors=colors)),
+    ):
+        stream.log(entity, style, static=True)
+
+
+def send_series(
+    stream: rr.RecordingStream, began_ns: int, entity: str, at_ns: Iterable[int] | NDArray[np.int64], values: Floats
+) -> None:
+    """Sends the values of all joints at some times, [times, joints]."""
+    columns = rr.Scalars.columns(scalars=values.reshape(-1)).partition([values.shape[1]] * len(values))
+    stream.send_columns(entity, indexes=time_columns(at_ns, began_ns), columns=columns)
 
 
 def eye(cells: Iterable[Cells], links: Iterable[Link], *, is_live: bool = False) -> rrb.EyeControls3D | None:
@@ -107,7 +162,6 @@ def eye(cells: Iterable[Cells], links: Iterable[Link], *, is_live: bool = False)
 
 def send_view(
     stream: rr.RecordingStream,
-    joints: Sequence[str],
     units: Units,
     *,
     eye: rrb.EyeControls3D | None,
@@ -117,15 +171,11 @@ def send_view(
 
     Args:
         stream: The stream.
-        joints: The names of the joints.
         units: The units of position and torque of each joint; empty if they are unknown.
         eye: The eye; None for no view of the robot.
         duration: The duration in s of what the plots show from 0 on; None for the present of a running bench.
     """
     positions, torques = unit_names(units)
-    paths = [entity_path(joint) for joint in joints]
-    torque_series = [f"$origin{path}/{series}" for path in paths for series in ("distributed", "central")]
-    differences = [f"$origin{path}/difference" for path in paths]
     is_live = duration is None
     shown = _LIVE_SECONDS if duration is None else duration
     # Beside the beginning there is room for a legend.
@@ -148,8 +198,8 @@ def send_view(
         )
 
     series = rrb.Vertical(
-        plot("/torques", torque_series, f"torques in {torques}, thick: cells, thin: central"),
-        plot("/torques", differences, f"difference in {torques}"),
+        plot("/torques", [DISTRIBUTED, CENTRAL], f"torques in {torques}, thick: cells, thin: central"),
+        plot("/torques", DIFFERENCE, f"difference in {torques}"),
         plot("/joints", "$origin/**", f"joints in {positions}", legend=True),
         rrb.TextLogView(
             origin="/contacts",

@@ -8,8 +8,8 @@
 
 | entity | content |
 |---|---|
-| `/joints/NAME` | position in rad or m |
-| `/torques/NAME/distributed`, `central`, `difference` | torques in Nm or N |
+| `/joints` | positions of all joints in rad or m |
+| `/torques/distributed`, `central`, `difference` | torques of all joints in Nm or N |
 | `/contacts` | text: a cell is touched, falls silent, or is back; `/contacts/count`: number of touched cells |
 | `/robot/links` | a line for each link that moves |
 | `/robot/cells/PATCH` | cells, coloured by force: grey while it is unknown, magenta if the cell is silent |
