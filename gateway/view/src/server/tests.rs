@@ -144,6 +144,27 @@ fn no_command_is_lost_while_another_page_sends_more_than_fit() {
 }
 
 #[test]
+fn a_server_that_ends_does_not_wait_for_a_page_that_waits_for_it() {
+    let server = served(None);
+    let mut flood = page(&server, "").unwrap();
+    for _ in 0..2 * COMMAND_QUEUE_SIZE {
+        flood.send(tungstenite::Message::text(r#"{"do":"resume"}"#)).unwrap();
+    }
+    let give_up = Instant::now() + TIMEOUT;
+    let shared = Arc::clone(&server.shared);
+    // Only a full queue shows that the page waits.
+    while shared.commands.try_send((0, PageCommand::Control(ControlCommand::Resume {}))).is_ok() {
+        assert!(Instant::now() < give_up);
+    }
+    drop(server);
+    while flood.read().is_ok() {}
+    while shared.pages.load(Ordering::Relaxed) > 0 {
+        assert!(Instant::now() < give_up, "the thread of the page does not end");
+        thread::sleep(Duration::from_millis(1));
+    }
+}
+
+#[test]
 fn a_page_without_a_token_is_served_to_anybody() {
     let server = served(None);
     assert_eq!([status(&get(&server, "/")), status(&get(&server, "/surface"))], ["200", "200"]);
