@@ -27,7 +27,9 @@ use view::server::{PageAccess, page_url};
 use view::{RowMesh, Token};
 
 use super::arguments::{BusKinds, bus_names, find_bus, parse_address, parse_time_ns};
-use super::input::{no_frame_failure, note_skin_difference, read_skin, skin_of_recording, stop_after_input, stop_flag};
+use super::input::{
+    no_frame_failure, note_skin_difference, read_skin, skin_of_recording, stop_after_input, stop_flag,
+};
 use super::output::print_note;
 use super::robot_file::{SkinRobot, urdf_path};
 use super::surface::robot_meshes;

@@ -62,10 +62,10 @@ mod flag {
     pub(super) const STUCK_BIT: u8 = 32;
 }
 
-/// Removes the central torques if any of them is NaN: they are unknown, as without a central computation.
-pub(crate) fn clear_if_unknown(central: &mut Vec<f64>) {
-    if central.iter().any(|torque| torque.is_nan()) {
-        central.clear();
+/// Removes torques if any of them is NaN, which means that they are unknown.
+pub(crate) fn clear_if_unknown(torques: &mut Vec<f64>) {
+    if torques.iter().any(|torque| torque.is_nan()) {
+        torques.clear();
     }
 }
 
@@ -277,7 +277,7 @@ impl LiveState {
     /// | 4 | cells, u32 |
     /// | 4 | 0: a snapshot |
     /// | 8 | seconds of the run, or since the first frame, f64 |
-    /// | 12 J | for each joint: position (rad or m), distributed and central torque (Nm or N; central NaN while unknown), f32 |
+    /// | 12 J | for each joint: position (rad or m), distributed and central torque (Nm or N; NaN while unknown), f32 |
     /// | 8 for each cell | status u8, flags u8, force mN u16, proximity 2^-15 u16, temperature 0.01 °C i16 |
     ///
     /// All values are little-endian. The torques are those of the last completed epoch. Status: 0 never heard, 1 quiet,

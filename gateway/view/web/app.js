@@ -101,7 +101,7 @@ function point3d() {
   if (!picture || state === shownArrows) return;
   shownArrows = state;
   const shown = $("arrows").checked;
-  most = Math.max(most, roundUp(Math.max(1, ...snapshot.joints.map((joint) => Math.abs(joint.distributed)))));
+  most = Math.max(most, roundUp(Math.max(1, ...snapshot.joints.map((joint) => Math.abs(joint.distributed) || 0))));
   picture.point(arrows(scene, turning, all, snapshot, { dark, force: shown, torque: shown && picture.theme.torque, alarm: picture.theme.alarm, most, late }));
   $("turn").textContent = `${Number(most.toPrecision(3))} ${scene.joints[0]?.torque_unit ?? "Nm"}`;
 }
@@ -185,7 +185,7 @@ const forceOf = (i) => { const { force, status } = cellOf(snapshot.cells, i); re
 // Tells the result of a press when the cell answers with a force and the joints with torques.
 function answerPress() {
   if (awaited < 0 || pressed !== awaited || !cellOf(snapshot.cells, awaited).force) return;
-  const torques = snapshot.joints.map(({ distributed }, at) => [Math.abs(distributed), at]), [size, at] = torques.reduce((a, b) => (b[0] > a[0] ? b : a), [0, 0]);
+  const torques = snapshot.joints.map(({ distributed }, at) => [Math.abs(distributed) || 0, at]), [size, at] = torques.reduce((a, b) => (b[0] > a[0] ? b : a), [0, 0]);
   if (size < 1e-3) return;
   words.tell(`Cell ${name(awaited)} is pressed: ${forceOf(awaited)}; the largest torque is ${number(snapshot.joints[at].distributed)} ${scene.joints[at].torque_unit}, of ${scene.joints[at].name}`);
   awaited = -1;

@@ -97,7 +97,8 @@ export function arrows(scene, axes, frames, { cells, joints }, { dark, force, to
   }
   for (const { joint, chain, row, slides, radius } of torque ? axes : []) {
     const share = Math.max(-1, Math.min(1, joints[joint].distributed / most)), m = frames[chain][row], broken = late.has(joint);
-    if (Math.abs(share) < LEAST) continue;
+    // An unknown torque has no arrow, either.
+    if (!(Math.abs(share) >= LEAST)) continue;
     const colour = broken ? alarm : torque, thick = radius * 0.055;
     if (slides) arrow(out, point(m, [radius, 0, 0]), point(m, [radius, 0, 3 * radius * share]), thick, colour);
     else bow(out, m, radius, thick, share * TURN, colour, broken);

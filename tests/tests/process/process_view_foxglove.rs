@@ -182,6 +182,32 @@ fn live_topics_are_those_of_the_recording() {
 }
 
 #[test]
+fn central_torques_are_absent_while_a_touch_from_before_the_view_lasts() {
+    let place = TestDir::new();
+    place.skin(6);
+    place.scenario(PRESSED);
+    let bench = place.running_bench(600.0, "");
+    let view = place.start("skinbus", "view skin.toml --bus-kind embedded --foxglove 0");
+    let mut viewer = Viewer::new(&viewer_url(&view));
+    viewer.subscribe_to_all();
+    let topic = "/UR5/torques";
+    let of_topic = |all: &[TopicMessage]| all.iter().filter(|it| it.topic == topic).count();
+    let came = viewer.read_until("torques", |_, all| of_topic(all) > 50);
+    bench.signal(Signal::INT);
+    bench.end().succeeded();
+    view.signal(Signal::INT);
+    view.end().succeeded();
+    let mut largest = 0.0_f64;
+    for message in came.iter().filter(|it| it.topic == topic) {
+        let torques = decode(viewer.definition(topic), &message.message);
+        assert_eq!(torques["central"], serde_json::json!([]), "{torques}");
+        let distributed = torques["distributed"].as_array().unwrap();
+        largest = distributed.iter().map(|it| it.as_f64().unwrap().abs()).fold(largest, f64::max);
+    }
+    assert!(largest > 0.1, "{largest} Nm");
+}
+
+#[test]
 fn viewers_that_sleep_or_talk_nonsense_disturb_neither_the_bench_nor_others() {
     let place = TestDir::new();
     place.skin(40);

@@ -103,14 +103,17 @@ impl LiveTopics {
         let Self { sink, topics, layout, .. } = self;
         let nanos = contacts.at_nanos;
         let column = |place: fn(&[f64; 3]) -> f64| joints.iter().map(place).collect::<Vec<_>>();
-        let (position, effort) = (column(|[position, ..]| *position), column(|[_, effort, _]| *effort));
-        let mut central = column(|[.., central]| *central);
-        clear_if_unknown(&mut central);
+        let position = column(|[position, ..]| *position);
+        let [mut effort, mut central] = [column(|[_, effort, _]| *effort), column(|[.., central]| *central)];
+        [&mut effort, &mut central].into_iter().for_each(clear_if_unknown);
         let names = &layout.joints;
         let state = JointState { nanos, names, position: &position, velocity: &[], effort: &effort };
         topics.write_joint_states(sink, &state);
         let active = u32::try_from(live.active_cell_count()).unwrap_or(u32::MAX);
-        topics.write_torques(sink, &Torques { nanos, distributed: &effort, central: &central, active });
+        // Before the first complete epoch there are none.
+        if !effort.is_empty() {
+            topics.write_torques(sink, &Torques { nanos, distributed: &effort, central: &central, active });
+        }
         topics.write_poses(sink, layout, nanos, &position);
     }
 

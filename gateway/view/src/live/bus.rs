@@ -59,8 +59,8 @@ pub(crate) struct LiveBus {
     /// The joint positions of the current epoch; `before` has those of the previous one.
     pub(crate) current: Option<BroadcastJoints>,
     pub(crate) previous: Option<BroadcastJoints>,
-    /// The distributed and the central torque of each joint of the chain in the last completed epoch; the central ones
-    /// are NaN while they are unknown.
+    /// The distributed and the central torque of each joint of the chain in the last completed epoch: NaN before the
+    /// first one, and the central ones while they are unknown.
     torques: [(f64, f64); MAX_JOINTS],
     joints: usize,
     /// The last torque of each cell with its time, by the cell's index on the bus.
@@ -89,7 +89,7 @@ impl LiveBus {
             sums: described.is_some_and(|bus| bus.reply != SkinReply::Torque),
             current: None,
             previous: None,
-            torques: [(0.0, 0.0); MAX_JOINTS],
+            torques: [(f64::NAN, f64::NAN); MAX_JOINTS],
             joints: skin.joints_on_bus(bus).len(),
             last: vec![None; cells],
             dead_since: vec![None; cells],
