@@ -74,7 +74,7 @@ pub(crate) struct ViewCommand {
     /// Address at which the page is served; port 0 stands for any free port
     #[arg(long, value_name = "ADDRESS:PORT", value_parser = parse_address, default_value_t = DEFAULT_ADDRESS)]
     listen: SocketAddr,
-    /// Read the secret token of the page's address from this file [default: the variable SKINBUS_TOKEN, else a random
+    /// Read the page's secret token from this file [default: the variable SKINBUS_TOKEN, else a random
     /// token]
     #[arg(long, value_name = "FILE")]
     token_file: Option<PathBuf>,
@@ -112,7 +112,7 @@ pub(crate) struct PageOptions {
     /// command ends; - for standard output
     #[arg(long, value_name = "FILE", requires = "view")]
     address_file: Option<PathBuf>,
-    /// Read the secret token of the page's address from this file [default: the variable SKINBUS_TOKEN, else a random
+    /// Read the page's secret token from this file [default: the variable SKINBUS_TOKEN, else a random
     /// token]
     #[arg(long, value_name = "FILE", requires = "view")]
     token_file: Option<PathBuf>,

@@ -118,7 +118,7 @@ impl ComparisonText<'_> {
         row("joints messages", none(), none(), replies_text(&only_joints));
         let touched = [contacts.only.only_a, contacts.only.only_b].map(|only| contacts.both + only);
         let [in_a, in_b] = touched.map(|touched| touched.to_string());
-        row("touched cells, all epochs", in_a, in_b, format!("{} in both", contacts.both));
+        row("touched cells, summed over epochs", in_a, in_b, format!("{} in both", contacts.both));
         for (name, replies, a, b) in
             [("torques", torques, a.torques, b.torques), ("sums", sums, a.sums, b.sums)]
         {

@@ -107,7 +107,7 @@ pub enum FailureReason {
         code: i16,
     },
     /// The cell lacks an ability that the skin needs.
-    #[error("does not support {0}: install newer firmware, or change the skin")]
+    #[error("does not support {0}: install newer firmware, or change the skin file so that it is not needed")]
     Cannot(MissingAbility),
     /// The answer of the cell differs from the written value.
     #[error(

@@ -53,7 +53,7 @@ pub(super) fn add_frame_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verb
 pub(super) fn add_timed_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     let Some(timed) = &bus.timed else { return };
     let load = timed.load.map_or_else(|| "-".to_owned(), |load| format!("{:.1} %", load * 100.0));
-    rows.add_row("  bus load", load, format!("at {}, with transmit queues {}", timed.rates, timed.queue));
+    rows.add_row("  bus load", load, format!("at {}; transmit queues: {}", timed.rates, timed.queue));
     rows.add_row(
         "  time of a frame, µs",
         format_quantiles(&timed.wait_us),
