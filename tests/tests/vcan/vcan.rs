@@ -122,7 +122,16 @@ fn the_choice_is_socketcan_and_a_missing_interface_is_no_reason_for_another_bus(
         "{}",
         bus.receive_buffer_bytes()
     );
-    let error = Bus::open("vcan77", KindChoice::Auto, &BusOptions::default()).unwrap_err();
+    let error = Bus::open("vcan77", KindChoice::Auto, &BusOptions::default()).unwrap_err().to_string();
+    let expected =
+        "there is no interface vcan77, and no running program serves an embedded bus of this name in ";
+    assert!(error.starts_with(expected), "{error}");
+    assert!(
+        error.ends_with("`vcan-setup up vcan77`, or serve the bus with `vcan-setup serve vcan77`"),
+        "{error}"
+    );
+    let only = KindChoice::Only(BusKind::SocketCan);
+    let error = Bus::open("vcan77", only, &BusOptions::default()).unwrap_err();
     let expected = "there is no interface vcan77: make it with `vcan-setup up vcan77`, or plug it in if \
                     it is hardware";
     assert_eq!(error.to_string(), expected);
