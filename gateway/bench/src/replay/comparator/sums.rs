@@ -127,6 +127,9 @@ impl SumsByCell {
 /// remainder into the next sum.
 pub(super) const MAX_ROUNDING_STEPS: u32 = 1;
 
+/// Maximum number of cells that are considered to have changed to or from one parent in an epoch.
+const MAX_MOVED_CELLS: usize = 4;
+
 /// A cell's own contribution to its sum.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct OwnContribution {
@@ -144,6 +147,26 @@ pub struct OwnContribution {
 }
 
 impl OwnContribution {
+    /// Returns the contribution of a cell that sends no sum.
+    fn nothing() -> Self {
+        Self { sum: Words::default(), count: 0, children: Vec::new(), steps: [Some(0); MAX_JOINTS], cells: 0 }
+    }
+
+    /// Returns this contribution with a sum added (`sign` 1) or subtracted (-1).
+    fn plus(mut self, sign: i32, sum: &CellSum) -> Self {
+        self.cells += sign * i32::from(sum.count);
+        for (own, word) in self.steps.iter_mut().zip(sum.torque.padded()) {
+            *own = own.zip(value_unless_saturated(word)).map(|(own, word)| own + sign * word);
+        }
+        self
+    }
+
+    /// Returns true if two contributions are of equally many cells, and unsaturated words differ by no more than
+    /// `allowed` steps.
+    fn is_near(&self, other: &Self, allowed: u32) -> bool {
+        self.cells == other.cells && self.step_differences(other).all(|steps| steps <= allowed)
+    }
+
     /// Returns true if all unsaturated words are zero.
     fn is_zero(&self) -> bool {
         self.steps.iter().flatten().all(|step| *step == 0)
@@ -266,29 +289,35 @@ impl<'a> EpochSums<'a> {
         adds_up && !self.children(cell).iter().any(silent)
     }
 
-    /// Returns true if a cell's sum exceeds that of the other side by the sum of a former or later child. By its page,
-    /// that cell is not a child in this epoch, because a page follows the change that it reports. Its sum must not be
-    /// contained in another parent's sum.
-    fn contains_moved_cell_sum(&self, cell: CellId, other: &Self, allowed: u32) -> bool {
-        let own_of = |cell| Some((self.own_contribution(cell)?, other.own_contribution(cell)?));
-        let Some((own, its)) = own_of(cell) else { return false };
-        let adds = |sum: &CellSum| {
-            let words = own.steps.iter().zip(&its.steps).zip(sum.torque.padded());
-            let mut words = words.filter_map(|((own, its), word)| {
-                Some(own.as_ref()? - its.as_ref()? - value_unless_saturated(word)?)
-            });
-            own.cells - its.cells == i32::from(sum.count) && words.all(|left| left.unsigned_abs() <= allowed)
-        };
+    /// Returns a cell's own contribution on this side and on the other, or `None` if the cell sent no sum on this side.
+    /// A cell without a sum on the other side contributes nothing there.
+    fn contributions(&self, cell: CellId, other: &Self) -> Option<[OwnContribution; 2]> {
+        let own = self.own_contribution(cell)?;
+        Some([own, other.own_contribution(cell).unwrap_or_else(OwnContribution::nothing)])
+    }
+
+    /// Returns true if a cell's sum differs from that of the other side by the sums of cells that have changed their
+    /// parent: it contains those of former or later children, or lacks those of present ones. By its page, such a cell
+    /// is still at its former parent in this epoch, because a page follows the change that it reports. An additional
+    /// sum must not be contained in another parent's sum.
+    fn contains_other_children(&self, cell: CellId, other: &Self, allowed: u32) -> bool {
+        let Some([own, its]) = self.contributions(cell, other) else { return false };
         let is_elsewhere = |mover: &CellId| {
             let parent = self.children.iter().find(|(_, children)| children.contains(mover));
             let parent = parent.and_then(|(parent, _)| CellId::new(i64::from(*parent)).ok());
-            parent.and_then(own_of).is_some_and(|(own, its)| own.cells >= its.cells)
+            let both = parent.and_then(|parent| self.contributions(parent, other));
+            both.is_some_and(|[own, its]| own.cells > its.cells || own.is_near(&its, allowed))
         };
-        self.parents.iter().any(|(mover, parents)| {
-            parents.contains(&cell.get())
-                && !self.children(cell).contains(mover)
-                && self.sums.0.get(mover).is_some_and(|sum| sum.count > 0 && adds(sum))
-                && !is_elsewhere(mover)
+        let movers = self.parents.iter().filter(|(_, parents)| parents.contains(&cell.get()));
+        let movers = movers.filter_map(|(mover, _)| {
+            let sum = self.sums.0.get(mover).filter(|sum| sum.count > 0)?;
+            let is_child = self.children(cell).contains(mover);
+            (is_child || !is_elsewhere(mover)).then_some((if is_child { -1 } else { 1 }, sum))
+        });
+        let movers: Vec<_> = movers.take(MAX_MOVED_CELLS).collect();
+        (1_u32..1 << movers.len()).any(|subset| {
+            let chosen = movers.iter().enumerate().filter(|(bit, _)| subset >> bit & 1 == 1);
+            chosen.fold(its.clone(), |its, (_, (sign, sum))| its.plus(*sign, sum)).is_near(&own, allowed)
         })
     }
 
@@ -328,7 +357,11 @@ pub(super) fn compare(
         return SumComparison::Omitted(OmitReason::NotTaken);
     }
     let (then, today) = (recorded.own_contribution(cell), now.own_contribution(cell));
-    match (then, today) {
+    // A cell that only forwards others' sums has no torque that could differ.
+    let is_in_contact = then.as_ref().or(today.as_ref()).is_some_and(|own| own.cells > 0);
+    let finer = 1 << (format.fraction_bits() - TorqueFormat::Q7_8.fraction_bits());
+    let allowed = MAX_ROUNDING_STEPS + if is_in_contact { u32::from(tolerance.div_ceil(finer)) } else { 0 };
+    let difference = match (&then, &today) {
         (Some(then), Some(today)) => {
             // A word can be saturated by the sum over a whole subtree, so in another tree other cells have saturated
             // words.
@@ -336,10 +369,6 @@ pub(super) fn compare(
                 value_unless_saturated(then).is_none() == value_unless_saturated(today).is_none()
                     || recorded.subtree(cell) != now.subtree(cell)
             };
-            // A cell that only forwards others' sums has no torque that could differ.
-            let finer = 1 << (format.fraction_bits() - TorqueFormat::Q7_8.fraction_bits());
-            let tolerance = if then.cells > 0 { tolerance.div_ceil(finer) } else { 0 };
-            let allowed = MAX_ROUNDING_STEPS + u32::from(tolerance);
             let mut words = then
                 .steps
                 .iter()
@@ -351,21 +380,19 @@ pub(super) fn compare(
                     (None, _) | (_, None) => alike(sum, other),
                 });
             if same {
-                SumComparison::Equal
-            } else if now.contains_moved_cell_sum(cell, recorded, allowed)
-                || recorded.contains_moved_cell_sum(cell, now, allowed)
-            {
-                SumComparison::Omitted(OmitReason::NotTaken)
-            } else {
-                SumComparison::Different
+                return SumComparison::Equal;
             }
+            SumComparison::Different
         }
         (Some(then), None) if then.cells > 0 => SumComparison::Missing,
         (None, Some(today)) if today.cells > 0 => SumComparison::Extra,
         // The tree decides whether a cell forwards sums of others, but forwarding adds no torque.
         (Some(own), None) | (None, Some(own)) if !own.is_zero() => SumComparison::Different,
-        (Some(_), None) | (None, Some(_) | None) => SumComparison::Nothing,
-    }
+        (Some(_), None) | (None, Some(_) | None) => return SumComparison::Nothing,
+    };
+    let moved = now.contains_other_children(cell, recorded, allowed)
+        || recorded.contains_other_children(cell, now, allowed);
+    if moved { SumComparison::Omitted(OmitReason::NotTaken) } else { difference }
 }
 
 #[cfg(test)]

@@ -149,6 +149,41 @@ fn a_child_with_a_late_page_is_no_difference_unless_it_is_counted_twice() {
 }
 
 #[test]
+fn children_that_change_places_with_late_pages_are_no_difference() {
+    // Cells 2 and 3 have changed places: by their pages they are at cells 1 and 4, which forward the other's sum.
+    let contact = vec![None, words(20), words(30), None];
+    let mut recorded = sums(&contact, &[0, 4, 1, 0]);
+    recorded.1 = ParentHistory::default();
+    for (node, parent, later) in [(1, 0, 0), (2, 1, 4), (3, 4, 1), (4, 0, 0)] {
+        recorded.1.set_parent(cell(node), Some(parent), 0);
+        recorded.1.set_parent(cell(node), Some(later), 9);
+    }
+    for (node, torque) in [(1, 30), (4, 20)] {
+        let torque = words(torque).unwrap().into();
+        recorded.0.0.insert(cell(node), CellSum { torque, count: 1 });
+    }
+    let [omitted, equal] = [SumComparison::Omitted(OmitReason::NotTaken), SumComparison::Equal];
+    // In the other tree the forwarding cells forward as the pages have it, or nothing.
+    for parents in [[0, 1, 0, 0], [0, 0, 0, 0]] {
+        let mut today = sums(&contact, &parents);
+        if parents[1] == 1 {
+            today.1 = ParentHistory::default();
+            for (node, parent) in [(1, 0), (2, 1), (3, 4), (4, 0)] {
+                today.1.set_parent(cell(node), Some(parent), 0);
+            }
+            today.0.0.insert(cell(4), CellSum { torque: words(30).unwrap().into(), count: 1 });
+        }
+        assert_eq!(outcomes(&recorded, &today, 4), [omitted, equal, equal, omitted]);
+        assert_eq!(outcomes(&today, &recorded, 4), [omitted, equal, equal, omitted]);
+    }
+    // A wrong word is still a difference.
+    let sum = recorded.0.0.get_mut(&cell(1)).unwrap();
+    sum.torque = [30, 5, -3, 0, 0, 0].into();
+    let today = sums(&contact, &[0, 0, 0, 0]);
+    assert_eq!(outcomes(&recorded, &today, 4)[0], SumComparison::Different);
+}
+
+#[test]
 fn a_cell_between_two_parents_is_omitted_and_an_unreachable_one_is_not() {
     let contact = vec![words(10), words(20)];
     let then = sums(&contact, &[0, 1]);
