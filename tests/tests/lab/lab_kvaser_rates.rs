@@ -128,11 +128,11 @@ fn the_doctor_knows_what_is_wrong_with_hardware() {
     bench.write(HALF);
     assert_eq!(bench.run("up skin.toml --set-bit-rates").0, 0);
     let doctor = || bench.run("doctor skin.toml --no-spawn").1;
-    assert!(doctor().contains("ok    can0 is at 500 kbit/s, as the skin says\n"), "{}", doctor());
+    assert!(doctor().contains("ok    can0 runs at 500 kbit/s, as the skin requires\n"), "{}", doctor());
     ip("link set can0 down");
     assert!(doctor().contains("fault can0 is CAN hardware (kvaser_pci), but down\n"), "{}", doctor());
     ip("link set can0 up type can listen-only on");
-    assert!(doctor().contains("fault can0 only listens"), "{}", doctor());
+    assert!(doctor().contains("fault can0 is in listen-only mode"), "{}", doctor());
     ip("link set can0 down");
     ip("link set can0 up type can listen-only off");
     bench.write(WHOLE);
