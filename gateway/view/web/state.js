@@ -15,3 +15,9 @@ export function stateOf({ connected, refusal, said }) {
   if (down.length) return { word: "live", text: `live, without ${down.length > 2 ? `${down.length} buses` : down.join(", ")}` };
   return { word: "live", text: "live" };
 }
+
+// The number of cells in a state, among those that were ever heard: of the others nothing is known.
+export function countOf(count, unheard, cells) {
+  if (unheard === cells) return "–";
+  return unheard ? `${count} of ${cells - unheard} heard` : String(count);
+}

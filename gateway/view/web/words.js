@@ -6,6 +6,7 @@ import { forget, frames } from "./frames.js";
 import { haltedWords } from "./halted.js";
 import { busKey } from "./legend.js";
 import { number } from "./scale.js";
+import { countOf } from "./state.js";
 import { clock, moment } from "./time.js";
 
 // With more buses than this, one table has a row for each.
@@ -69,11 +70,12 @@ function many(buses, health) {
 export function say(scene, said, ask, health, hardest) {
   const sum = (of) => said.buses.reduce((all, bus) => all + of(bus), 0);
   const [due, complete] = [sum((bus) => bus.epochs_due), sum((bus) => bus.epochs_complete)];
+  const known = (count) => countOf(count, said.unheard, scene.cells.length);
   facts([
     ["Cells", String(scene.cells.length)],
-    ["In contact", String(said.contacts)],
+    ["In contact", known(said.contacts)],
     ...(hardest ? [["Pressed hardest", hardest]] : []),
-    ["Silent", String(said.dead), said.dead ? "bad" : ""],
+    ["Silent", known(said.dead), said.dead ? "bad" : ""],
     ["Epochs complete", ...(due ? noted(health, said.buses.map((_, b) => `${b} incomplete`), `${complete} of ${due}`) : ["–"])],
   ]);
   const halted = haltedWords(said, scene.may_press);

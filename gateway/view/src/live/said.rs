@@ -26,6 +26,8 @@ pub struct StatusMessage {
     pub is: &'static str,
     /// The number of cells in contact.
     pub contacts: usize,
+    /// The number of cells of which no frame has been received, so that their contact is unknown.
+    pub unheard: usize,
     /// The number of dead cells.
     pub dead: usize,
     /// Some of the dead cells, at most 20.
@@ -237,10 +239,11 @@ impl LiveState {
     /// Returns the status that all pages get, without the details of a cell.
     #[must_use]
     pub fn status_message(&self, now: Micros) -> StatusMessage {
-        let (mut contacts, mut dead, mut dead_cells) = (0, 0, Vec::new());
+        let (mut contacts, mut unheard, mut dead, mut dead_cells) = (0, 0, 0, Vec::new());
         for bus in &self.buses {
             for ((cell, status), since) in bus.table.statuses(now).zip(&bus.dead_since) {
                 contacts += usize::from(matches!(status, CellStatus::Active | CellStatus::Stale));
+                unheard += usize::from(status == CellStatus::Unknown);
                 dead += usize::from(status == CellStatus::Dead);
                 if let Some(since) = since.filter(|_| dead_cells.len() < MAX_LISTED_DEAD_CELLS) {
                     let for_s = (self.seconds_since_start(now) - self.seconds_since_start(since)).max(0.0);
@@ -251,6 +254,7 @@ impl LiveState {
         StatusMessage {
             is: "said",
             contacts,
+            unheard,
             dead,
             dead_cells,
             halted: self.buses.iter().any(|bus| bus.halted),

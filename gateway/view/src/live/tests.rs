@@ -254,5 +254,7 @@ fn a_bus_with_sums_says_where_cells_are_in_the_tree() {
     bench.now.0 += 5_000_000;
     bench.live.handle_time(bench.now);
     assert_eq!(places(&bench), [None; 4], "they are silent");
-    assert_eq!(Bench::new().live.status_message(Micros(0)).buses[0].tree, None, "torques have no tree");
+    let said = Bench::new().live.status_message(Micros(0));
+    assert_eq!(said.buses[0].tree, None, "torques have no tree");
+    assert_eq!(said.unheard, Bench::new().live.skin.cells.len());
 }

@@ -8,7 +8,7 @@ import { haltedWords } from "../halted.js";
 import { Health } from "../health.js";
 import { valueAt } from "../lane.js";
 import { bounds, followed, groups, niceStep, number, rowsOf, secondDigits, tickText, ticks, within, zoomed } from "../scale.js";
-import { stateOf } from "../state.js";
+import { countOf, stateOf } from "../state.js";
 import { clock, moment } from "../time.js";
 
 test("ticks are round, lie within the axis, and are no more than asked for", () => {
@@ -153,6 +153,10 @@ test("live, playing, paused, waiting and lost have different words", () => {
     ["live", "playing", "playing, 0.5 ×", "paused", "paused at the end"]);
   assert.equal(of({ buses: [{ name: "vcan0", up: false }] }).text, "waiting: vcan0 is down");
   assert.equal(of({ buses: [{ name: "a", up: true }, { name: "b", up: false }] }).text, "live, without b");
+});
+
+test("cells that were never heard are not counted as known", () => {
+  assert.deepEqual([countOf(0, 253, 253), countOf(2, 3, 253), countOf(2, 0, 253)], ["–", "2 of 250 heard", "2"]);
 });
 
 test("a halt of a recording has its reason and its time, and one of a run what to do", () => {
