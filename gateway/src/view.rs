@@ -188,7 +188,7 @@ impl ViewCommand {
                 let path = path.display();
                 return Err(Failure::usage_error(format!(
                     "--foxglove {port}: {path} is a candump log, and only an MCAP recording has topics: convert \
-                     it with `skinbus convert {path} -o FILE.mcap`, or leave the option out"
+                     it with `skinbus convert {path} FILE.mcap`, or leave the option out"
                 )));
             }
         }

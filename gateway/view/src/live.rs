@@ -170,7 +170,8 @@ impl LiveState {
     }
 
     /// Returns two torques for each joint of the robot in the last completed epoch, in Nm or N: the distributed and the
-    /// central one, which is NaN while a touched cell's sensor values are unknown.
+    /// central one. Both are NaN while no bus of the joint has completed an epoch, and the central one while a touched
+    /// cell's sensor values are unknown.
     #[must_use]
     pub fn joint_torques(&self) -> Vec<[f64; 2]> {
         self.joint_positions_and_torques()
@@ -179,18 +180,21 @@ impl LiveState {
             .collect()
     }
 
-    /// Returns three values for each joint of the robot: position, distributed torque and central torque, which is NaN
-    /// while unknown.
+    /// Returns three values for each joint of the robot: position, distributed torque and central torque. A torque is NaN
+    /// while it is unknown. Buses that have not completed an epoch do not count.
     pub(crate) fn joint_positions_and_torques(&self) -> Vec<[f64; 3]> {
-        let mut rows = vec![[0.0_f64; 3]; self.skin.robot.joints.len()];
+        let mut rows = vec![[0.0, f64::NAN, f64::NAN]; self.skin.robot.joints.len()];
         for (index, bus) in self.buses.iter().enumerate() {
             for ((place, (joint, _)), torque) in
                 self.skin.joints_on_bus(index).enumerate().zip(bus.joint_torques())
             {
                 let Some([position, distributed, central]) = rows.get_mut(joint) else { continue };
                 *position = bus.joint_position(place).unwrap_or(*position);
-                *distributed += torque.0;
-                *central += torque.1;
+                if torque.0.is_nan() {
+                    continue;
+                }
+                let others = if distributed.is_nan() { (0.0, 0.0) } else { (*distributed, *central) };
+                (*distributed, *central) = (others.0 + torque.0, others.1 + torque.1);
             }
         }
         rows

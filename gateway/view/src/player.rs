@@ -361,7 +361,7 @@ impl Player {
     /// | 4 | joints J of the robot, u32 |
     /// | 4 | moments, u32 |
     /// | 4 | 1: a history |
-    /// | 8 + 8 J for each moment | s of the run, or since the first frame, f64; distributed and central torque of each joint (central NaN while unknown), f32 |
+    /// | 8 + 8 J for each moment | s of the run, or since the first frame, f64; distributed and central torque of each joint (NaN while unknown), f32 |
     #[must_use]
     pub fn encode_torque_history(&self) -> Vec<u8> {
         let joints = self.skin.robot.joints.len();

@@ -194,7 +194,7 @@ export class Plots {
       const answer = this.recorded.part(`/curves?of=${of}`, from, to, count, fresh, async (response) => decodeCurves(await response.arrayBuffer()));
       if (!answer) return [];
       const quantity = what === "torque" ? 3 * lane.joint + (curve === 0 ? 1 : 0) : what === "difference" ? 3 * lane.joint + 2 : lane.bus ?? 0;
-      // The cells' torque is known in each epoch.
+      // Where the cells' torque is known, and this one is not, the curve has a gap.
       const all = points(answer, quantity, what === "torque" || what === "difference" ? 3 * lane.joint : quantity);
       return what === "load" ? all.map((v, k) => (k % 3 ? v * 100 : v)) : all;
     }

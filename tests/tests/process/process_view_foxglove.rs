@@ -338,6 +338,6 @@ fn what_cannot_be_served_is_refused_in_one_line() {
     assert!(said.refusal(2).contains(&expected), "{}", said.refusal(2));
     let said = place.start("skinbus", "view classic.log --skin skin.toml --foxglove 0").end();
     let expected = "--foxglove 0: classic.log is a candump log, and only an MCAP recording has topics: convert it with \
-                    `skinbus convert classic.log -o FILE.mcap`, or leave the option out";
+                    `skinbus convert classic.log FILE.mcap`, or leave the option out";
     assert!(said.refusal(2).contains(expected), "{}", said.refusal(2));
 }

@@ -208,7 +208,7 @@ def _start_view(bench: Bench) -> subprocess.Popen[str]:
     environment.pop("SKINBUS_TOKEN", None)
     kinds = [f"--bus-kind={one.bus}={one.kind}" for one in bench.ready.buses]
     command = [str(program_path("skinbus")), "view", bench.skin, "--read-only", "--foxglove", "0", *kinds]
-    # The program ends with this one, whose end of the pipe is closed then.
+    # The program ends with this one and those that it has forked, because they have the other end of the pipe.
     return subprocess.Popen(
         [*command, "--end-with-input"],
         env=environment,

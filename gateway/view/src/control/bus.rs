@@ -95,7 +95,7 @@ impl ControlBus {
         self.live.previous.is_some()
     }
 
-    /// Returns position, distributed torque and central torque of each joint of the chain; the latter is NaN while
+    /// Returns position, distributed torque and central torque of each joint of the chain. A torque is NaN while it is
     /// unknown.
     pub(super) fn joint_values(&self) -> Vec<[f64; 3]> {
         let torques = self.live.joint_torques().enumerate();

@@ -17,7 +17,7 @@ use trace::ros2::standard::{JointState, Point};
 
 use super::hub::HubSink;
 use super::server::FoxgloveServer;
-use crate::live::{LiveState, clear_if_unknown};
+use crate::live::LiveState;
 
 /// The interval between diagnostics messages, in µs.
 const DIAGNOSTICS_INTERVAL_US: u64 = 500_000;
@@ -105,12 +105,17 @@ impl LiveTopics {
         let column = |place: fn(&[f64; 3]) -> f64| joints.iter().map(place).collect::<Vec<_>>();
         let position = column(|[position, ..]| *position);
         let [mut effort, mut central] = [column(|[_, effort, _]| *effort), column(|[.., central]| *central)];
-        [&mut effort, &mut central].into_iter().for_each(clear_if_unknown);
+        // Joints whose buses have not completed an epoch are NaN in both.
+        if joints.iter().any(|[_, effort, central]| central.is_nan() && !effort.is_nan()) {
+            central.clear();
+        }
+        if effort.iter().all(|torque| torque.is_nan()) {
+            effort.clear();
+        }
         let names = &layout.joints;
         let state = JointState { nanos, names, position: &position, velocity: &[], effort: &effort };
         topics.write_joint_states(sink, &state);
         let active = u32::try_from(live.active_cell_count()).unwrap_or(u32::MAX);
-        // Before the first complete epoch there are none.
         if !effort.is_empty() {
             topics.write_torques(sink, &Torques { nanos, distributed: &effort, central: &central, active });
         }

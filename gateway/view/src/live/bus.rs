@@ -243,7 +243,7 @@ impl LiveBus {
         self.table.presumed_sensors(now).nth(self.table.index_of(node)?)?.0
     }
 
-    /// Returns the distributed and the central torque of each joint of the chain; the latter is NaN while unknown.
+    /// Returns the distributed and the central torque of each joint of the chain, NaN while they are unknown.
     pub(crate) fn joint_torques(&self) -> impl Iterator<Item = (f64, f64)> {
         self.torques.into_iter().take(self.joints)
     }

@@ -152,6 +152,27 @@ fn a_touch_from_before_the_view_makes_the_central_torque_unknown_until_it_ends()
 }
 
 #[test]
+fn torques_are_those_of_the_buses_that_have_completed_an_epoch() {
+    let target = SkinRequest { cells: 8, buses: 2, ..SkinRequest::default() };
+    let skin = Skin::parse("two", &generate(&target).unwrap()).unwrap();
+    let mut bench = Bench { live: LiveState::new(skin), now: Micros(1_000_000), bus: 0 };
+    let from = CellId::new(1).unwrap();
+    let mut after = |bus: usize, epoch: u8, messages: usize| {
+        bench.bus = bus;
+        bench.joints(epoch, Q);
+        if messages > 1 {
+            bench.say(&Message::Torque { from, epoch: Epoch(epoch), torque: [4096, 0, 0, 0, 0, 0].into() });
+            bench.joints(epoch + 1, Q);
+        }
+        float(&bench.snapshot(), 24 + 4)
+    };
+    assert!(after(0, 1, 1).is_nan(), "the first epoch is not over");
+    assert_eq!(after(0, 2, 2), 1.0);
+    assert_eq!(after(1, 1, 1), 1.0, "of one bus");
+    assert_eq!(after(1, 2, 2), 2.0, "of both");
+}
+
+#[test]
 fn a_silent_cell_is_dead_since_it_was_noticed_and_a_halt_stands_until_the_resume() {
     let mut bench = Bench::new();
     bench.heartbeat(5, 0);

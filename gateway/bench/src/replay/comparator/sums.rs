@@ -127,6 +127,26 @@ impl SumsByCell {
 /// remainder into the next sum.
 pub(super) const MAX_ROUNDING_STEPS: u32 = 1;
 
+/// The difference in steps that rounding and the tolerance of a comparison allow.
+#[derive(Clone, Copy, Debug)]
+struct Rounding {
+    /// The tolerance in steps of a sum.
+    tolerance: u32,
+}
+
+impl Rounding {
+    fn new(tolerance: u16, format: TorqueFormat) -> Self {
+        let finer = 1 << (format.fraction_bits() - TorqueFormat::Q7_8.fraction_bits());
+        Self { tolerance: u32::from(tolerance.div_ceil(finer)) }
+    }
+
+    /// Returns the allowed difference of a contribution. A cell that only forwards others' sums has no torque that
+    /// could differ.
+    const fn allowed(self, own: &OwnContribution) -> u32 {
+        MAX_ROUNDING_STEPS + if own.cells > 0 { self.tolerance } else { 0 }
+    }
+}
+
 /// Maximum number of cells that are considered to have changed to or from one parent in an epoch.
 const MAX_MOVED_CELLS: usize = 4;
 
@@ -159,12 +179,6 @@ impl OwnContribution {
             *own = own.zip(value_unless_saturated(word)).map(|(own, word)| own + sign * word);
         }
         self
-    }
-
-    /// Returns true if two contributions are of equally many cells, and unsaturated words differ by no more than
-    /// `allowed` steps.
-    fn is_near(&self, other: &Self, allowed: u32) -> bool {
-        self.cells == other.cells && self.step_differences(other).all(|steps| steps <= allowed)
     }
 
     /// Returns true if all unsaturated words are zero.
@@ -300,13 +314,17 @@ impl<'a> EpochSums<'a> {
     /// parent: it contains those of former or later children, or lacks those of present ones. By its page, such a cell
     /// is still at its former parent in this epoch, because a page follows the change that it reports. An additional
     /// sum must not be contained in another parent's sum.
-    fn contains_other_children(&self, cell: CellId, other: &Self, allowed: u32) -> bool {
+    fn contains_other_children(&self, cell: CellId, other: &Self, rounding: Rounding) -> bool {
         let Some([own, its]) = self.contributions(cell, other) else { return false };
         let is_elsewhere = |mover: &CellId| {
             let parent = self.children.iter().find(|(_, children)| children.contains(mover));
             let parent = parent.and_then(|(parent, _)| CellId::new(i64::from(*parent)).ok());
             let both = parent.and_then(|parent| self.contributions(parent, other));
-            both.is_some_and(|[own, its]| own.cells > its.cells || own.is_near(&its, allowed))
+            both.is_some_and(|[own, its]| {
+                own.cells > its.cells
+                    || own.cells == its.cells
+                        && own.step_differences(&its).all(|steps| steps <= rounding.allowed(&its))
+            })
         };
         let movers = self.parents.iter().filter(|(_, parents)| parents.contains(&cell.get()));
         let movers = movers.filter_map(|(mover, _)| {
@@ -315,9 +333,23 @@ impl<'a> EpochSums<'a> {
             (is_child || !is_elsewhere(mover)).then_some((if is_child { -1 } else { 1 }, sum))
         });
         let movers: Vec<_> = movers.take(MAX_MOVED_CELLS).collect();
+        let allowed = rounding.allowed(&its);
         (1_u32..1 << movers.len()).any(|subset| {
             let chosen = movers.iter().enumerate().filter(|(bit, _)| subset >> bit & 1 == 1);
-            chosen.fold(its.clone(), |its, (_, (sign, sum))| its.plus(*sign, sum)).is_near(&own, allowed)
+            let moved =
+                chosen.fold(OwnContribution::nothing(), |moved, (_, (sign, sum))| moved.plus(*sign, sum));
+            let words = own.steps.iter().zip(&its.steps).zip(&moved.steps);
+            // A word that is known on both sides must be known of the moved cells, too.
+            let mut compared = words.filter_map(|((own, its), moved)| {
+                let steps = own.as_ref()? - its.as_ref()?;
+                Some(moved.map(|moved| (steps - moved).unsigned_abs()))
+            });
+            // Small sums would explain differences between contributions of equally many cells by rounding.
+            let explains =
+                moved.cells != 0 || moved.steps.iter().flatten().any(|step| step.unsigned_abs() > allowed);
+            explains
+                && own.cells - its.cells == moved.cells
+                && compared.all(|left| left.is_some_and(|left| left <= allowed))
         })
     }
 
@@ -357,12 +389,10 @@ pub(super) fn compare(
         return SumComparison::Omitted(OmitReason::NotTaken);
     }
     let (then, today) = (recorded.own_contribution(cell), now.own_contribution(cell));
-    // A cell that only forwards others' sums has no torque that could differ.
-    let is_in_contact = then.as_ref().or(today.as_ref()).is_some_and(|own| own.cells > 0);
-    let finer = 1 << (format.fraction_bits() - TorqueFormat::Q7_8.fraction_bits());
-    let allowed = MAX_ROUNDING_STEPS + if is_in_contact { u32::from(tolerance.div_ceil(finer)) } else { 0 };
-    let difference = match (&then, &today) {
+    let rounding = Rounding::new(tolerance, format);
+    match (&then, &today) {
         (Some(then), Some(today)) => {
+            let allowed = rounding.allowed(then);
             // A word can be saturated by the sum over a whole subtree, so in another tree other cells have saturated
             // words.
             let alike = |then: i16, today: i16| {
@@ -382,17 +412,16 @@ pub(super) fn compare(
             if same {
                 return SumComparison::Equal;
             }
-            SumComparison::Different
         }
-        (Some(then), None) if then.cells > 0 => SumComparison::Missing,
-        (None, Some(today)) if today.cells > 0 => SumComparison::Extra,
+        (Some(then), None) if then.cells > 0 => return SumComparison::Missing,
+        (None, Some(today)) if today.cells > 0 => return SumComparison::Extra,
         // The tree decides whether a cell forwards sums of others, but forwarding adds no torque.
-        (Some(own), None) | (None, Some(own)) if !own.is_zero() => SumComparison::Different,
+        (Some(own), None) | (None, Some(own)) if !own.is_zero() => {}
         (Some(_), None) | (None, Some(_) | None) => return SumComparison::Nothing,
-    };
-    let moved = now.contains_other_children(cell, recorded, allowed)
-        || recorded.contains_other_children(cell, now, allowed);
-    if moved { SumComparison::Omitted(OmitReason::NotTaken) } else { difference }
+    }
+    let moved = now.contains_other_children(cell, recorded, rounding)
+        || recorded.contains_other_children(cell, now, rounding);
+    if moved { SumComparison::Omitted(OmitReason::NotTaken) } else { SumComparison::Different }
 }
 
 #[cfg(test)]
