@@ -458,6 +458,39 @@ def test_torques_are_logged_while_central_ones_are_unknown(tmp_path: Path) -> No
         assert logged.chunks[entity] <= 2
 
 
+def test_series_of_other_joints_in_a_stream_keep_their_names(tmp_path: Path) -> None:
+    stream = rr.RecordingStream("two robots")
+    stream.save(tmp_path / "two.rrd")
+    for joints, torque in ((["a", "b"], [1.0, 2.0]), (["x", "y", "z"], [3.0, 4.0, 5.0]), (["a", "b"], [6.0, 7.0])):
+        log = Log(stream, 1_000_000_000)
+        topics = Topics(log, joints, {tuple(joints)})
+        topics.add("/arm/torques", torques(torque, torque), [])
+        log.set_time(2_000_000_000)
+        topics.end(2_000_000_000)
+    stream.disconnect()
+    logged, unknown = Logged(tmp_path / "two.rrd"), [float("nan")]
+    for torque_entity, names, expected in (
+        ("/torques", ["a", "b"], [[1.0, 2.0], unknown * 2, [6.0, 7.0], unknown * 2]),
+        ("/torques_2", ["x", "y", "z"], [[3.0, 4.0, 5.0], unknown * 3]),
+    ):
+        entity = f"{torque_entity}/distributed"
+        assert logged.static_values(entity, "SeriesLines:names")[-1] == names
+        np.testing.assert_array_equal(logged.scalars(entity), expected)
+        assert logged.cleared_at(torque_entity) == 2_000_000_000
+
+
+def test_values_are_sent_after_the_clock_was_set_back(tmp_path: Path) -> None:
+    stream = rr.RecordingStream("clock")
+    stream.save(tmp_path / "clock.rrd")
+    topics = Topics(Log(stream, 0), ["a"], {("a",)})
+    for _ in range(2):
+        topics.add("/arm/torques", torques([1.0], [1.0]), [])
+        topics._batch._oldest_ns = 10**18
+    topics.add("/arm/torques", torques([2.0], [2.0]), [])
+    stream.disconnect()
+    assert Logged(tmp_path / "clock.rrd").scalars("/torques/distributed").tolist() == [1.0, 1.0, 2.0]
+
+
 def test_a_closed_viewer_is_a_warning() -> None:
     class Closed:
         is_connected = True

@@ -109,6 +109,9 @@ class LiveLog:
         ending.start()
         ending.join(_VIEW_TIMEOUT)
         self._stack.close()
+        for pipe in (self._view.stdin, self._view.stderr):
+            if pipe is not None:
+                pipe.close()
         view.finish(self.stream, is_own=self._is_own)
         self._is_closed = True
 

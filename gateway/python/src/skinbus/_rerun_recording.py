@@ -32,27 +32,27 @@ def log_recording(stream: rr.RecordingStream, recorded: Recording, paths: Sequen
     stream.send_recording_name(paths[0].name)
     stream.send_recording_start_time_nanos(recorded.began_ns)
     moments = _moments(paths)
-    duration = _log_epochs(stream, recorded)
+    series = view.log_series_style(stream, recorded.joint_names)
+    duration = _log_epochs(stream, recorded, series)
     _log_contacts(stream, recorded, moments.silences)
     _log_moments(stream, moments, recorded.began_ns)
     clouds = [cells for cells_of_patch in moments.clouds.values() for cells in cells_of_patch]
     eye = view.eye(clouds, [link for links in moments.links.values() for link in links])
-    view.send_view(stream, recorded.joint_units, eye=eye, duration=duration)
+    view.send_view(stream, series, recorded.joint_units, eye=eye, duration=duration)
 
 
-def _log_epochs(stream: rr.RecordingStream, recorded: Recording) -> float:
+def _log_epochs(stream: rr.RecordingStream, recorded: Recording, series: view.SeriesEntities) -> float:
     """Logs positions and torques of all epochs. Returns the time of the last one in s.
 
     There is no difference in epochs with missing replies: it would show their torques, not an error of computation.
     """
     epochs = recorded.epochs()
     differences = np.where(np.asarray(epochs.open_cells)[:, np.newaxis] > 0, np.nan, epochs.error)
-    view.log_series_style(stream, epochs.names)
     for entity, values in (
-        (view.POSITIONS, epochs.positions),
-        (view.DISTRIBUTED, epochs.distributed),
-        (view.CENTRAL, epochs.central),
-        (view.DIFFERENCE, differences),
+        (series.positions, epochs.positions),
+        (series.distributed, epochs.distributed),
+        (series.central, epochs.central),
+        (series.difference, differences),
     ):
         view.send_series(stream, recorded.began_ns, entity, np.array(epochs.at_ns), np.array(values))
     return (int(epochs.at_ns[-1]) - recorded.began_ns) * _NANOS if len(epochs) else 1.0

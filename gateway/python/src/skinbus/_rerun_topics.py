@@ -48,6 +48,7 @@ class _Batch:
         self._series: dict[str, tuple[list[int], list[Floats]]] = {}
         self._clouds: dict[str, list[Cells]] = {}
         self._links: dict[int, list[Link]] = {}
+        self._linked_ns = 0
         # The labels that the stream has, by patch.
         self._labels: dict[str, list[str]] = {}
 
@@ -61,7 +62,8 @@ class _Batch:
     def add_cells(self, cells: Cells, scene: Scene) -> None:
         """Adds the cells of a patch, and the links at the same time."""
         self._clouds.setdefault(cells.patch, []).append(cells)
-        if cells.at_ns not in self._links:
+        if cells.at_ns != self._linked_ns:
+            self._linked_ns = cells.at_ns
             self._links[cells.at_ns] = scene.links()
         self._add_time(cells.at_ns)
 
@@ -90,11 +92,11 @@ class _Batch:
         self._oldest_ns = None
 
     def _add_time(self, at_ns: int) -> None:
-        """Sends everything if the oldest has waited long enough."""
+        """Sends everything if the oldest has waited long enough, or if the clock was set back."""
         self._log.last_ns = max(self._log.last_ns, at_ns)
         if self._oldest_ns is None:
             self._oldest_ns = at_ns
-        elif at_ns - self._oldest_ns >= _BATCH_NS:
+        elif not 0 <= at_ns - self._oldest_ns < _BATCH_NS:
             self.send()
 
 
@@ -110,7 +112,7 @@ class Topics:
         self._first: dict[str, Cells] = {}
         self._units: list[tuple[str, str]] = []
         view.log_robot_style(log.stream)
-        view.log_series_style(log.stream, joints)
+        self._entities = view.log_series_style(log.stream, joints)
 
     def add(self, topic: str, message: bytes, topics: Collection[str]) -> None:
         """Logs a message on one of some topics."""
@@ -121,7 +123,7 @@ class Topics:
             state = _ros2.joint_state(message)
             of_joint = dict(zip(state.names, state.positions.tolist(), strict=False))
             positions = np.array([of_joint.get(name, np.nan) for name in self._joints])
-            self._batch.add_values(state.at_ns, view.POSITIONS, positions)
+            self._batch.add_values(state.at_ns, self._entities.positions, positions)
         elif topic.endswith("/torques"):
             self._add_torques(_ros2.torques(message))
         else:
@@ -131,7 +133,7 @@ class Topics:
         if self._joints not in self._viewed and self._is_complete(topics):
             self._viewed.add(self._joints)
             eye = view.eye(self._first.values(), self._scene.links(), is_live=True)
-            view.send_view(self._log.stream, self._units, eye=eye, duration=None)
+            view.send_view(self._log.stream, self._entities, self._units, eye=eye, duration=None)
 
     def send(self) -> None:
         """Sends everything that waits for later messages."""
@@ -140,7 +142,7 @@ class Topics:
     def end(self, at_ns: int) -> None:
         """Ends the series, and clears what would stand as current. The time of the log is set."""
         self._batch.end(at_ns)
-        for entity in ("/torques", "/joints", "/robot"):
+        for entity in (self._entities.torques, self._entities.positions, "/robot"):
             self._log.stream.log(entity, rr.Clear(recursive=True))
 
     def _is_complete(self, topics: Collection[str]) -> bool:
@@ -157,9 +159,9 @@ class Topics:
         central = torques.central if len(torques.central) else unknown
         difference = unknown if self._scene.is_incomplete else torques.distributed - central
         for entity, values in (
-            (view.DISTRIBUTED, torques.distributed),
-            (view.CENTRAL, central),
-            (view.DIFFERENCE, difference),
+            (self._entities.distributed, torques.distributed),
+            (self._entities.central, central),
+            (self._entities.difference, difference),
         ):
             self._batch.add_values(torques.at_ns, entity, values)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import rerun as rr
@@ -16,11 +17,6 @@ from skinbus._scene import Cells, Link
 
 Floats = NDArray[np.float64]
 Units = Sequence[tuple[str, str]]
-
-# Entities of series. Each has a value for each joint, because a viewer spends its time on each entity.
-POSITIONS, DISTRIBUTED, CENTRAL, DIFFERENCE = (
-    "/joints", "/torques/distributed", "/torques/central", "/torques/difference",
-)  # fmt: skip
 
 _LINK_COLOR = (82, 86, 92)
 _ARROW_COLOR = (230, 60, 60)
@@ -34,6 +30,33 @@ _EYE_DIRECTION = np.array([0.62, -0.88, 0.38])
 _EYE_HALF_ANGLE, _EYE_FILL = math.radians(27.5), 0.9
 # Time in s that plots of a running bench show, and the part of each plot that its legend covers.
 _LIVE_SECONDS, _LEGEND_SHARE = 20.0, 0.22
+
+
+@dataclass(frozen=True)
+class SeriesEntities:
+    """The entities of the series of some joints.
+
+    Each has the values of all joints: the time that a viewer needs grows with the number of entities.
+    """
+
+    positions: str
+    torques: str
+
+    @property
+    def distributed(self) -> str:
+        return f"{self.torques}/distributed"
+
+    @property
+    def central(self) -> str:
+        return f"{self.torques}/central"
+
+    @property
+    def difference(self) -> str:
+        return f"{self.torques}/difference"
+
+
+# Series by the id of the recording and the joints.
+_series: dict[str, dict[tuple[str, ...], SeriesEntities]] = {}
 
 
 def entity_path(*parts: str) -> str:
@@ -109,18 +132,25 @@ def send_links(stream: rr.RecordingStream, began_ns: int, links: Mapping[int, Se
         stream.send_columns("/robot/links", indexes=time_columns(drawn, began_ns), columns=strips)
 
 
-def log_series_style(stream: rr.RecordingStream, joints: Sequence[str]) -> None:
-    """Logs names and colours of series: a joint has one colour in all views."""
+def log_series_style(stream: rr.RecordingStream, joints: Sequence[str]) -> SeriesEntities:
+    """Logs names and colours of series: a joint has one colour in all views. Returns the entities of the series.
+
+    Other joints in the same recording, as of a second robot, have entities of their own.
+    """
+    known = _series.setdefault(str(stream.get_recording_id()), {})
+    number = "" if not known else f"_{len(known) + 1}"
+    series = known.setdefault(tuple(joints), SeriesEntities(f"/joints{number}", f"/torques{number}"))
     colors = [_JOINT_COLORS[at % len(_JOINT_COLORS)] for at in range(len(joints))]
     pale = [tuple(int(0.5 * part + 110) for part in color) for color in colors]
     central = [f"{joint} central" for joint in joints]
     for entity, style in (
-        (POSITIONS, rr.SeriesLines(names=joints, colors=colors)),
-        (DISTRIBUTED, rr.SeriesLines(names=joints, colors=colors, widths=[2] * len(joints))),
-        (CENTRAL, rr.SeriesLines(names=central, colors=pale, widths=[1] * len(joints))),
-        (DIFFERENCE, rr.SeriesLines(names=joints, colors=colors)),
+        (series.positions, rr.SeriesLines(names=joints, colors=colors)),
+        (series.distributed, rr.SeriesLines(names=joints, colors=colors, widths=[2] * len(joints))),
+        (series.central, rr.SeriesLines(names=central, colors=pale, widths=[1] * len(joints))),
+        (series.difference, rr.SeriesLines(names=joints, colors=colors)),
     ):
         stream.log(entity, style, static=True)
+    return series
 
 
 def send_series(
@@ -162,6 +192,7 @@ def eye(cells: Iterable[Cells], links: Iterable[Link], *, is_live: bool = False)
 
 def send_view(
     stream: rr.RecordingStream,
+    entities: SeriesEntities,
     units: Units,
     *,
     eye: rrb.EyeControls3D | None,
@@ -171,6 +202,7 @@ def send_view(
 
     Args:
         stream: The stream.
+        entities: The entities of the series.
         units: The units of position and torque of each joint; empty if they are unknown.
         eye: The eye; None for no view of the robot.
         duration: The duration in s of what the plots show from 0 on; None for the present of a running bench.
@@ -198,9 +230,13 @@ def send_view(
         )
 
     series = rrb.Vertical(
-        plot("/torques", [DISTRIBUTED, CENTRAL], f"torques in {torques}, thick: cells, thin: central"),
-        plot("/torques", DIFFERENCE, f"difference in {torques}"),
-        plot("/joints", "$origin/**", f"joints in {positions}", legend=True),
+        plot(
+            entities.torques,
+            [entities.distributed, entities.central],
+            f"torques in {torques}, thick: cells, thin: central",
+        ),
+        plot(entities.torques, entities.difference, f"difference in {torques}"),
+        plot(entities.positions, entities.positions, f"joints in {positions}", legend=True),
         rrb.TextLogView(
             origin="/contacts",
             name="contacts",

@@ -15,6 +15,8 @@
 | `/robot/cells/PATCH` | cells, coloured by force: grey while it is unknown, magenta if the cell is silent |
 | `/robot/forces/PATCH` | an arrow for each touched cell |
 
+Series of other joints in the same Rerun recording, as of a second robot, are `/joints_2`, `/torques_2/...`, and so on.
+
 Central torques and differences have gaps while they are unknown, differences also while replies of cells are missing.
 When a bench or its log ends, its joints, torques and robot are cleared.
 
