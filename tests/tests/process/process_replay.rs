@@ -357,7 +357,12 @@ fn sums_without_their_children_come_back_in_any_tree() {
     let lines: Vec<_> = text.lines().map(str::trim).collect();
     assert!(lines[1].starts_with(&format!("recorded  sum {root} epoch ")), "{text}");
     assert!(lines[1].contains("; without its child"), "{text}");
-    assert_eq!(lines.get(3), Some(&"joint 2: 5 steps lower (0.0195 Nm)"), "{text}");
+    // In another tree this cell may have nothing to forward.
+    if lines[2] == "now       nothing" {
+        assert!(lines[1].ends_with(": 0.000 0.020 0.000 0.000 0.000 0.000 Nm"), "{text}");
+    } else {
+        assert_eq!(lines.get(3), Some(&"joint 2: 5 steps lower (0.0195 Nm)"), "{text}");
+    }
     place.is_left_clean();
 }
 
