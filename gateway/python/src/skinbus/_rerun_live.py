@@ -65,8 +65,11 @@ class LiveLog:
         self._lock = threading.Lock()
         self._has_topics = self._has_events = True
         self._is_closing = self._is_closed = False
+        self._bench = bench
         events = bench.events()
         self._first_event = events[-1].index + 1 if events else 0
+        self._next_event = 0
+        self._touched, self._silent = set[str](), set[str]()
         self._view = _start_view(bench)
         try:
             self._socket = _connect(self._view, self._stack)
@@ -74,7 +77,7 @@ class LiveLog:
             self._names = dict[int, str]()
             self._threads = [
                 threading.Thread(target=self._follow_topics, name="skinbus to Rerun", daemon=True),
-                threading.Thread(target=self._follow_events, args=(bench,), name="skinbus events", daemon=True),
+                threading.Thread(target=self._follow_events, name="skinbus events", daemon=True),
             ]
             for thread in self._threads:
                 thread.start()
@@ -118,6 +121,9 @@ class LiveLog:
     def _end_log(self) -> None:
         with self._lock:
             if self._has_events:
+                # The other thread may not have logged the newest ones yet.
+                for event in self._bench.events():
+                    self._add_event(event)
                 self._has_events = False
                 self._end("the log has ended")
 
@@ -172,32 +178,35 @@ class LiveLog:
         begun = [{"id": channel["id"], "channelId": channel["id"]} for channel in new]
         self._socket.send(json.dumps({"op": "subscribe", "subscriptions": begun}))
 
-    def _follow_events(self, bench: Bench) -> None:
+    def _follow_events(self) -> None:
         """Logs contacts and silent cells of the bench until its end, and then ends the view."""
-        touched, silent = set[str](), set[str]()
         with contextlib.suppress(RunFailed):
-            for event in bench.follow():
+            for event in self._bench.follow():
                 with self._lock:
                     if not self._has_events:
                         return
-                    self._add_event(event, touched, silent, is_old=event.index < self._first_event)
+                    self._add_event(event)
         with self._lock:
             if self._has_events:
                 self._has_events = False
                 self._end("the bench has ended")
         self._view.terminate()
 
-    def _add_event(self, event: Event, touched: set[str], silent: set[str], *, is_old: bool) -> None:
+    def _add_event(self, event: Event) -> None:
+        """Logs an event, unless it was logged before. The caller holds the lock."""
+        if event.index < self._next_event:
+            return
+        self._next_event = event.index + 1
         if isinstance(event, Contact):
             change = "is touched" if event.touched else "is no longer touched"
-            (touched.add if event.touched else touched.discard)(event.cell)
+            (self._touched.add if event.touched else self._touched.discard)(event.cell)
             self._log.add_event(event.at_ns, f"{event.cell} {change}")
-            self.stream.log("/contacts/count", rr.Scalars(float(len(touched))))
-        elif isinstance(event, CellState) and (event.state == "dead") != (event.cell in silent):
-            is_back = event.cell in silent
-            (silent.discard if is_back else silent.add)(event.cell)
+            self.stream.log("/contacts/count", rr.Scalars(float(len(self._touched))))
+        elif isinstance(event, CellState) and (event.state == "dead") != (event.cell in self._silent):
+            is_back = event.cell in self._silent
+            (self._silent.discard if is_back else self._silent.add)(event.cell)
             # The event has no time, so only those from now on are logged.
-            if not is_old:
+            if event.index >= self._first_event:
                 silence = Silence(time.time_ns(), event.cell, is_back)
                 self._log.add_event(silence.at_ns, silence.text)
 
