@@ -180,10 +180,10 @@ impl LiveState {
             .collect()
     }
 
-    /// Returns three values for each joint of the robot: position, distributed torque and central torque. A torque is NaN
-    /// while it is unknown. Buses that have not completed an epoch do not count.
+    /// Returns three values for each joint of the robot: position, distributed torque and central torque. A value is NaN
+    /// while it is unknown. For torques, buses that have not completed an epoch do not count.
     pub(crate) fn joint_positions_and_torques(&self) -> Vec<[f64; 3]> {
-        let mut rows = vec![[0.0, f64::NAN, f64::NAN]; self.skin.robot.joints.len()];
+        let mut rows = vec![[f64::NAN; 3]; self.skin.robot.joints.len()];
         for (index, bus) in self.buses.iter().enumerate() {
             for ((place, (joint, _)), torque) in
                 self.skin.joints_on_bus(index).enumerate().zip(bus.joint_torques())
@@ -281,7 +281,7 @@ impl LiveState {
     /// | 4 | cells, u32 |
     /// | 4 | 0: a snapshot |
     /// | 8 | seconds of the run, or since the first frame, f64 |
-    /// | 12 J | for each joint: position (rad or m), distributed and central torque (Nm or N; NaN while unknown), f32 |
+    /// | 12 J | for each joint: position (rad or m), distributed and central torque (Nm or N), NaN while unknown, f32 |
     /// | 8 for each cell | status u8, flags u8, force mN u16, proximity 2^-15 u16, temperature 0.01 °C i16 |
     ///
     /// All values are little-endian. The torques are those of the last completed epoch. Status: 0 never heard, 1 quiet,

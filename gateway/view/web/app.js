@@ -25,8 +25,9 @@ import * as words from "./words.js";
 
 const $ = (id) => document.getElementById(id);
 const canvas = $("picture"), camera = new Camera(), health = new Health();
-// What the picture shows of the scene: its outline, its links, its joints' axes; the pose, and the one to expect.
-let parts = [], links = [], turning = [], pose = new Float64Array(), soon = pose, poses = [], drawnAt = 0, jumps = true, most = 1, shownArrows = null, shownAxes = "";
+// What the picture shows of the scene: its outline, its links, its joints' axes; the pose, and the one to expect; the number
+// of joints whose positions are unknown.
+let parts = [], links = [], turning = [], pose = new Float64Array(), soon = pose, poses = [], drawnAt = 0, jumps = true, unplaced = 0, most = 1, shownArrows = null, shownAxes = "";
 let picture = null, scene = null, plots = null, snapshot = null, said = null, all = null, trees = [], chosen = -1, pressed = -1, awaited = -1, isPressing = false;
 // For browser tests.
 window.skinbus = { frames: 0, snapshots: 0, where, camera, filled: () => filled(), joints: () => snapshot?.joints.map((joint) => joint.position) ?? [] };
@@ -227,7 +228,7 @@ async function surface(of) {
 const link = new Link({
   scene(it) {
     scene = it;
-    [chosen, pressed, snapshot, said, all, jumps, most, poses, shownArrows] = [-1, -1, null, null, null, true, 1, [], null];
+    [chosen, pressed, snapshot, said, all, jumps, most, poses, shownArrows, unplaced] = [-1, -1, null, null, null, true, 1, [], null, 0];
     [parts, links, turning] = [outline(scene), cylinders(scene), axesOf(scene)];
     camera.fit();
     health.forget();
@@ -243,7 +244,11 @@ const link = new Link({
   },
   snapshot(it) {
     snapshot = it;
-    const joints = it.joints.map((joint) => joint.position), first = !all;
+    // Links whose joints' positions are unknown are drawn as at 0. The first position of a joint is no motion.
+    const joints = it.joints.map((joint) => joint.position || 0), first = !all;
+    const missing = it.joints.filter((joint) => Number.isNaN(joint.position)).length;
+    if (missing < unplaced) [jumps, poses] = [true, []];
+    unplaced = missing;
     all = frames(scene, joints);
     placeRobot(joints, it.time);
     if (first || jumps && camera.auto && camera.steers) direct(it.cells);

@@ -25,7 +25,9 @@ fn a_press_is_a_torque_and_a_release_takes_it_away() {
         (&page.scene["may_press"], &page.scene["joints"][1]["torque_unit"]),
         (&true.into(), &"Nm".into())
     );
-    let rest = page.wait_for_snapshot("all cells quiet", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    let rest = page.wait_for_snapshot("all cells quiet, and the joints' positions", |it| {
+        it.cells.iter().all(|cell| cell.0 == 1) && it.joints.iter().all(|joint| !joint[0].is_nan())
+    });
     assert!(rest.cells.iter().all(|cell| cell.1 == 0 && cell.2 == 0));
     page.send(r#"{"do":"choose","cell":5}"#);
     page.press(5, 6.0);

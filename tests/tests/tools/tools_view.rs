@@ -110,7 +110,7 @@ fn a_click_in_a_browser_is_a_torque_on_the_bus_and_the_arm_gives_way() {
     let number = |value: &serde_json::Value| value.as_f64().unwrap();
     let stage = browser.value("(() => { const b = document.getElementById('picture').getBoundingClientRect(); return [b.x, b.y]; })()");
     let at = [number(&stage[0]) + number(&found[1]), number(&stage[1]) + number(&found[2])];
-    let before = browser.value("window.skinbus.joints()");
+    let before = browser.until("(() => { const all = window.skinbus.joints(); return all.length && all.every(Number.isFinite) && all; })()");
     browser.mouse("mousePressed", at);
     browser.until("document.getElementById('facts').textContent.includes('In contact1')");
     browser.until("document.getElementById('cell').textContent.includes('Torque of epoch')");

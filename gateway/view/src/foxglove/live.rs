@@ -87,7 +87,7 @@ impl LiveTopics {
         seen.epochs += 1;
         let joints = live.joint_positions_and_torques();
         let mut q = [0.0; MAX_ROBOT_JOINTS];
-        q.iter_mut().zip(&joints).for_each(|(q, [position, ..])| *q = *position);
+        q.iter_mut().zip(drawn_positions(&joints)).for_each(|(q, position)| *q = position);
         if live.is_clock(bus) {
             self.publish_joints(&contacts, live, &joints);
         }
@@ -119,7 +119,7 @@ impl LiveTopics {
         if !effort.is_empty() {
             topics.write_torques(sink, &Torques { nanos, distributed: &effort, central: &central, active });
         }
-        topics.write_poses(sink, layout, nanos, &position);
+        topics.write_poses(sink, layout, nanos, &drawn_positions(joints).collect::<Vec<_>>());
     }
 
     fn publish_dropped_frames(&mut self, bus: usize, dropped: u64) {
@@ -151,5 +151,21 @@ impl LiveTopics {
             })
             .collect();
         self.topics.write_diagnostics(&mut self.sink, at.0 * 1_000, &parts);
+    }
+}
+
+/// Returns the joint positions for drawing: 0 for one that is unknown.
+fn drawn_positions(joints: &[[f64; 3]]) -> impl Iterator<Item = f64> {
+    joints.iter().map(|[position, ..]| if position.is_nan() { 0.0 } else { *position })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::drawn_positions;
+
+    #[test]
+    fn links_of_joints_with_unknown_positions_are_drawn_as_at_0() {
+        let joints = [[0.5, 1.0, 1.0], [f64::NAN; 3], [-0.25, f64::NAN, f64::NAN]];
+        assert_eq!(drawn_positions(&joints).collect::<Vec<_>>(), [0.5, 0.0, -0.25]);
     }
 }

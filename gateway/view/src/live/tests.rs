@@ -173,6 +173,22 @@ fn torques_are_those_of_the_buses_that_have_completed_an_epoch() {
 }
 
 #[test]
+fn the_position_of_a_joint_is_unknown_until_a_bus_has_sent_it() {
+    let mut skin = skin();
+    // No bus has the last joint.
+    let other = skin.robot.joints[0].clone();
+    skin.robot.joints.push(other);
+    let mut bench = Bench { live: LiveState::new(skin), now: Micros(1_000_000), bus: 0 };
+    let mut unknown = |epoch: Option<u8>| {
+        epoch.iter().for_each(|epoch| bench.joints(*epoch, Q));
+        let bytes = bench.snapshot();
+        (0..7).filter(|joint| float(&bytes, 24 + 12 * joint).is_nan()).collect::<Vec<_>>()
+    };
+    assert_eq!(unknown(None), [0, 1, 2, 3, 4, 5, 6]);
+    assert_eq!(unknown(Some(1)), [6]);
+}
+
+#[test]
 fn a_silent_cell_is_dead_since_it_was_noticed_and_a_halt_stands_until_the_resume() {
     let mut bench = Bench::new();
     bench.heartbeat(5, 0);
