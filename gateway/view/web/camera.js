@@ -6,9 +6,9 @@ import { add, cross, dot, look, perspective, times, unit } from "./math.js";
 const FOCUS = 6;
 // The share of the picture that the robot is to fill along the side that it fills most; the shares between which the zoom
 // keeps it, and the one that it must not leave.
-const FILL = 0.84, TIGHT = 0.81, ROOMY = 0.88, MOST = 0.985;
+const FILL = 0.87, TIGHT = 0.85, ROOMY = 0.89, MOST = 0.985;
 // The zoom changes by at most this much in a second, and how directly it follows.
-const RATE = Math.log(1.19), STIFF = 7;
+const RATE = Math.log(1.19), STIFF = 10;
 // If the robot becomes larger or smaller faster than the zoom may follow, beyond these shares, the view turns by itself:
 // how fast in rad/s, how far up and down, and the angle that it tries.
 const EASY = [0.8, 0.88], STEER_RATE = 2, STEERED = [0.15, 1.35], TRIED = 0.03;

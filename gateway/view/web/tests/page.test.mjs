@@ -197,7 +197,7 @@ test("the demo is held from every side, at the uneven times at which a busy mach
       }
     }
   }
-  assert.ok(drawn > 3000 && small <= drawn / 100, `${small} of ${drawn} frames`);
+  assert.ok(drawn > 3000 && small <= drawn / 500, `${small} of ${drawn} frames`);
 });
 
 test("a robot that grows faster than any zoom in one frame is held by what turning can give", () => {
@@ -227,7 +227,7 @@ test("a user's view stays where it is until it is to fit again, and a turned vie
   assert.deepEqual([camera.yaw, camera.middle, camera.distance], [yaw, middle, distance]);
   camera.fit();
   follow();
-  assert.ok(Math.abs(filled(camera, pose, w, h)[0] - 0.84) < 1e-6);
+  assert.ok(Math.abs(filled(camera, pose, w, h)[0] - 0.87) < 1e-6);
   camera.turnTo(2, 0.4, false);
   assert.ok(camera.moves);
   for (let k = 0; k < 60; k++) follow();
@@ -269,7 +269,7 @@ test("a zoom keeps what is under the pointer, a drag moves it, and a cell is fac
   camera.fit();
   follow();
   const [share, outside] = filled(camera, box, w, h);
-  assert.ok(Math.abs(share - 0.84) < 1e-6 && outside < 0);
+  assert.ok(Math.abs(share - 0.87) < 1e-6 && outside < 0);
 });
 
 test("arrows that a snapshot repeats do not change the picture", () => {
