@@ -104,7 +104,9 @@ function point3d() {
   const shown = $("arrows").checked;
   most = Math.max(most, roundUp(Math.max(1, ...snapshot.joints.map((joint) => Math.abs(joint.distributed) || 0))));
   picture.point(arrows(scene, turning, all, snapshot, { dark, force: shown, torque: shown && picture.theme.torque, alarm: picture.theme.alarm, most, late }));
-  $("turn").textContent = `${Number(most.toPrecision(3))} ${scene.joints[0]?.torque_unit ?? "Nm"}`;
+  const turn = `${Number(most.toPrecision(3))} ${scene.joints[0]?.torque_unit ?? "Nm"}`;
+  // Setting a text has the browser lay out the page, even if it is the same.
+  if ($("turn").textContent !== turn) $("turn").textContent = turn;
 }
 
 // Draws the axes of the robot's base in the corner.

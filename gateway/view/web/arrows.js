@@ -8,9 +8,9 @@ import { DEAD, cellOf } from "./snapshot.js";
 // The number of floats of a corner: a position and a colour.
 export const FLOATS = 6;
 // The most arrows, which are those of the largest forces; the length of one of 10 N in pitches; the sides of a shaft.
-const MOST_ARROWS = 80, LONG = 6.5, SIDES = 6;
+const MOST_ARROWS = 80, LONG = 6.5, SIDES = 4;
 // The turn of the arrow for the largest torque, and the steps that it is drawn in.
-const TURN = 1.5 * Math.PI, STEPS = 36;
+const TURN = 1.5 * Math.PI, STEPS = 24;
 // Torques below this share of the largest have no arrow.
 const LEAST = 0.03;
 const LIGHT = unit([0.4, -0.5, 0.77]);
@@ -18,7 +18,9 @@ const LIGHT = unit([0.4, -0.5, 0.77]);
 const across = (z) => unit(cross(z, Math.abs(z[2]) < 0.9 ? [0, 0, 1] : [1, 0, 0]));
 const shaded = (colour, n) => colour.map((v) => v * (0.66 + 0.34 * Math.max(0, dot(n, LIGHT))));
 
-// A band between two rings of points, with the directions in which the points are seen.
+// A band between two rings of points, with the directions in which the points are seen. These turn left around the way
+// along the arrow, so that the corners of a triangle turn left, seen from outside. A ring that widens in its plane faces
+// back.
 function band(out, from, to, ways, colour) {
   ways.forEach((way, k) => {
     const next = (k + 1) % ways.length, c = shaded(colour, way), d = shaded(colour, ways[next]);
@@ -49,17 +51,20 @@ function bow(out, m, radius, thick, angle, colour, broken) {
   const head = Math.min(5 * thick / radius, size * 0.6), from = Math.PI / 2 - sign * TURN / 2;
   const at = (turn) => {
     const a = from + sign * turn, way = direction(m, [Math.cos(a), Math.sin(a), 0]);
-    return { way, middle: add(middle, way, radius), ways: [way, z, way.map((v) => -v), z.map((v) => -v)] };
+    return { way, middle: add(middle, way, radius), ways: [way, z.map((v) => -sign * v), way.map((v) => -v), z.map((v) => sign * v)] };
   };
-  const parts = Math.max(3, Math.ceil(STEPS * size / TURN));
+  const parts = Math.max(3, Math.ceil(STEPS * size / TURN)), dark = colour.map((v) => v * 0.7);
   let last = at(0);
   for (let k = 1; k <= parts; k++) {
     const next = at((size - head) * k / parts);
-    if (!broken || k % 2) band(out, ring(last.middle, last.ways, thick), ring(next.middle, next.ways, thick), next.ways, colour);
+    const [begin, end] = [ring(last.middle, last.ways, thick), ring(next.middle, next.ways, thick)];
+    if (k === 1 || broken && k % 2) band(out, ring(last.middle, last.ways, 0), begin, last.ways, dark);
+    if (!broken || k % 2) band(out, begin, end, next.ways, colour);
+    if (broken && k % 2 && k < parts) band(out, end, ring(next.middle, next.ways, 0), next.ways, dark);
     last = next;
   }
   const back = ring(last.middle, last.ways, 2.4 * thick * Math.min(1, 0.4 + size));
-  band(out, ring(last.middle, last.ways, thick), back, last.ways, colour.map((v) => v * 0.7));
+  band(out, ring(last.middle, last.ways, broken && parts % 2 === 0 ? 0 : thick), back, last.ways, dark);
   band(out, back, ring(at(size).middle, last.ways, 0), last.ways, colour);
 }
 

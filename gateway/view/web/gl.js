@@ -50,3 +50,24 @@ export function floats(gl, data, layout) {
     offset += n * 4;
   }
 }
+
+// A buffer of the corners of triangles, as their indices, for the bound vertex array.
+export function elements(gl, data) {
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, data, gl.STATIC_DRAW);
+}
+
+// The different corners among those of triangles, each a number of floats, and the index of each triangle's corners.
+// A corner then need not be computed for each triangle.
+export function shared(data, floats) {
+  const known = new Map(), corners = [], all = new Uint32Array(data.length / floats);
+  for (let k = 0; k < all.length; k++) {
+    const corner = data.slice(k * floats, (k + 1) * floats), key = corner.join();
+    if (!known.has(key)) {
+      known.set(key, known.size);
+      corners.push(...corner);
+    }
+    all[k] = known.get(key);
+  }
+  return { corners: new Float32Array(corners), indices: all };
+}

@@ -2,7 +2,7 @@
 
 import { FLOATS as ARROW_FLOATS } from "./arrows.js";
 import { colourOf, css, isDark, rgb, shapeOf } from "./colours.js";
-import { context, floats, program } from "./gl.js";
+import { context, elements, floats, program, shared } from "./gl.js";
 import { ground } from "./ground.js";
 import { atlas } from "./numbers.js";
 import { cellOf } from "./snapshot.js";
@@ -32,7 +32,7 @@ float written(vec2 dx, vec2 dy) {
 
 const SOLID = [`layout(location=0) in vec3 at; layout(location=1) in vec3 n; uniform mat4 view, m; uniform vec3 colour; out vec3 c;
 ${LIGHT}
-void main() { c = colour * (.58 + .42 * light(mat3(m) * n)); gl_Position = view * m * vec4(at, 1.); }`,
+void main() { c = colour * (.58 + .42 * light(mat3(m) * n)); gl_Position = view * (m * vec4(at, 1.)); }`,
 `in vec3 c; out vec4 o;
 void main() { o = vec4(c, 1.); }`];
 
@@ -45,7 +45,7 @@ void main() {
   float l = .62 + .38 * light(mat3(m) * n);
   place = uv; inner = look.rgb * l; rim = edge * l; kind = int(look.w * 255. + .5); node = int(number + .5);
   ink = dot(look.rgb, vec3(.299, .587, .114)) > .38 ? vec3(.06, .08, .09) : vec3(1.);
-  gl_Position = view * m * vec4(at, 1.);
+  gl_Position = view * (m * vec4(at, 1.));
 }`,
 `in vec2 place; flat in vec3 inner, rim, ink; flat in int kind, node; uniform vec3 mark, chosen; out vec4 o;
 ${NUMBERS}
@@ -143,18 +143,17 @@ export class Picture {
     const nearest = neighbors(scene), { corners, fan } = this.software ? TRIANGLE : HEXAGON;
     [this.vertices, this.indices] = [corners.length, fan.length];
     const data = new Float32Array(order.length * corners.length * 9), size = scene.pitch * 0.56;
-    const indices = new Uint32Array(order.length * fan.length);
+    const fans = new Uint32Array(order.length * fan.length);
     order.forEach((i, at) => {
       const { node, position, normal } = scene.cells[i], [x, y] = axes(scene, nearest, i);
       const middle = add(position, normal, 0.0012);
       corners.forEach(([u, v], k) => data.set([...add(add(middle, x, u * size), y, v * size), ...normal, u, v, node], (at * corners.length + k) * 9));
-      fan.forEach((corner, k) => { indices[at * fan.length + k] = at * corners.length + corner; });
+      fan.forEach((corner, k) => { fans[at * fan.length + k] = at * corners.length + corner; });
     });
     this.cells = gl.createVertexArray();
     gl.bindVertexArray(this.cells);
     floats(gl, data, [[0, 3], [1, 3], [2, 2], [4, 1]]);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
+    elements(gl, fans);
     this.looks = new Uint32Array(order.length * corners.length);
     this.look = gl.createBuffer();
     gl.bindBuffer(gl.ARRAY_BUFFER, this.look);
@@ -210,8 +209,10 @@ export class Picture {
     return [...parts.values()].map(({ chain, row, data }) => {
       const vao = gl.createVertexArray();
       gl.bindVertexArray(vao);
-      floats(gl, new Float32Array(data), [[0, 3], [1, 3]]);
-      return { chain, row, vao, first: 0, count: data.length / 6 };
+      const { corners, indices } = shared(data, 6);
+      floats(gl, corners, [[0, 3], [1, 3]]);
+      elements(gl, indices);
+      return { chain, row, vao, first: 0, count: indices.length };
     });
   }
 
@@ -304,9 +305,10 @@ export class Picture {
     for (const { chain, row, vao, first, count } of this.shells ?? this.round) {
       gl.bindVertexArray(vao);
       gl.uniformMatrix4fv(solid.m, false, frames[chain][row]);
-      gl.drawArrays(gl.TRIANGLES, first, count);
+      if (this.shells) gl.drawArrays(gl.TRIANGLES, first, count);
+      else gl.drawElements(gl.TRIANGLES, count, gl.UNSIGNED_INT, first * 4);
     }
-    gl.disable(gl.CULL_FACE);
+    gl.enable(gl.CULL_FACE);
     gl.useProgram(this.plain.program);
     gl.uniformMatrix4fv(this.plain.view, false, view);
     for (const [{ vao, count }, kind] of [[this.arrows, gl.TRIANGLES], [this.ground, gl.LINES]]) {
@@ -314,6 +316,7 @@ export class Picture {
       gl.bindVertexArray(vao);
       gl.drawArrays(kind, 0, count);
     }
+    gl.disable(gl.CULL_FACE);
     return true;
   }
 }

@@ -78,7 +78,7 @@ export function triangles({ from, to, radius }) {
   const put = (p, n) => out.push(...p, ...n);
   if (length(axis) < 1e-6) return out;
   for (let k = 0; k < SIDES; k++) {
-    const [a, b] = [k, k + 1].map((i) => 2 * Math.PI * i / SIDES).map((t) => add(x.map((v) => v * Math.cos(t)), y, Math.sin(t)));
+    const [a, b] = [k, (k + 1) % SIDES].map((i) => 2 * Math.PI * i / SIDES).map((t) => add(x.map((v) => v * Math.cos(t)), y, Math.sin(t)));
     const at = (end, n) => add(end, n, radius);
     for (const [p, n] of [[at(from, a), a], [at(from, b), b], [at(to, b), b], [at(from, a), a], [at(to, b), b], [at(to, a), a]]) put(p, n);
     const down = z.map((v) => -v);

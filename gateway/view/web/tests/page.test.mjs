@@ -3,14 +3,11 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 
 import { about, allowed, isDown, processOf } from "../bench.js";
-import { arrows, axesOf, roundUp } from "../arrows.js";
 import { AHEAD_S, Camera } from "../camera.js";
 import { BUSES, SHAPES, SHOWS, busColour, colourOf, ramp, shapeOf } from "../colours.js";
-import { axes as axesSeen, ground, spacing } from "../ground.js";
 import { haltedWords } from "../halted.js";
 import { Health } from "../health.js";
 import { cross, direction, dot, look, perspective, point, project, row, times, unit } from "../math.js";
-import { Picture } from "../picture.js";
 import { Pace, Painter, SOFTWARE_HZ, STILL_MS } from "../pace.js";
 import { axes, cylinders, facing, frames, neighbors, outline, placed, triangles } from "../robot.js";
 import { cellOf, decode, decodeHistory } from "../snapshot.js";
@@ -272,28 +269,6 @@ test("a zoom keeps what is under the pointer, a drag moves it, and a cell is fac
   assert.ok(Math.abs(share - 0.87) < 1e-6 && outside < 0);
 });
 
-test("arrows that a snapshot repeats do not change the picture", () => {
-  const filled = [], picture = Object.assign(Object.create(Picture.prototype), { arrows: { count: 0 }, fill: (_, corners) => filled.push(corners[0]) });
-  for (const x of [1, 1, 2, 2, 1]) picture.point(new Float32Array([x, 0, 0]));
-  assert.deepEqual(filled, [1, 2, 1]);
-});
-
-test("arrows show contact forces and torques about the joints' axes, and gaps in them late replies", () => {
-  const { scene: of, at } = demo, all = frames(of, at[0]);
-  const it = { ...of, cells: [1, 2, 3].map((node) => ({ bus: 0, node, row: 2, joint: 2, position: [0, 0, 0.07], normal: [0, 0, 1], neighbors: [], root: false })) };
-  const joints = of.joints.map((_, j) => ({ position: at[0][j], distributed: j === 1 ? 5 : 0, central: 0 }));
-  const words = (...pressed) => Uint32Array.from(pressed.flatMap(([status, newtons]) => [status | newtons * 1000 << 16, 0]));
-  const draw = (cells, options) => arrows(it, axesOf(it), all, { cells, joints }, { dark: true, most: 10, late: new Set(), torque: null, force: false, alarm: [1, 0, 0], ...options });
-  const one = draw(words([2, 0], [2, 5], [4, 5]), { force: true });
-  assert.ok(one.length > 0, "of the second: the first is at rest, and the third is silent");
-  assert.equal(draw(words([2, 5], [2, 5], [4, 5]), { force: true }).length, 2 * one.length);
-  assert.equal(draw(words([2, 0], [2, 0], [2, 0]), { force: true }).length, 0);
-  const whole = draw(words([2, 0], [2, 0], [2, 0]), { torque: [0, 0, 1] }), broken = draw(words([2, 0], [2, 0], [2, 0]), { torque: [0, 0, 1], late: new Set([1]) });
-  assert.ok(whole.length > 0 && broken.length < 0.8 * whole.length, "one joint, with gaps");
-  assert.ok(broken[3] > 0 && broken[5] === 0 && whole[3] === 0 && whole[5] > 0, "in the colour of what is bad");
-  assert.deepEqual([0.3, 1, 1.2, 4.2, 73].map(roundUp).map((v) => Number(v.toPrecision(2))), [0.5, 1, 2, 5, 100]);
-});
-
 test("totals that grow are bad for a while, and a seek forgets when", () => {
   const health = new Health(), at = (time, total) => { health.begin(time); return health.count("lost", total); };
   assert.deepEqual([at(1, 5), at(2, 5), at(3, 7)], [0, 0, 2]);
@@ -302,16 +277,6 @@ test("totals that grow are bad for a while, and a seek forgets when", () => {
   assert.deepEqual([health.last("lost"), health.isPresent("lost")], [3, false]);
   at(2, 7);
   assert.equal(health.last("lost"), null);
-});
-
-test("the ground fades into the background, with the axes of the base", () => {
-  const back = [0, 0, 0], all = ground(1, -0.2, back, [1, 1, 1]);
-  assert.equal(spacing(1), 0.1);
-  assert.ok(all.length % 12 === 0 && all.every(Number.isFinite));
-  const far = [];
-  for (let i = 0; i < all.length; i += 6) { assert.ok(Math.abs(all[i + 2] + 0.2) < 1e-6); if (Math.hypot(all[i], all[i + 1]) >= 1.4) far.push(...all.slice(i + 3, i + 6)); }
-  assert.ok(far.length && far.every((v) => v === 0));
-  assert.deepEqual(axesSeen([[1, 0, 0], [0, 0, 1], [0, -1, 0]]).map(({ name }) => name)[0], "y", "the farthest first");
 });
 
 test("numbers are short", () => {
