@@ -51,21 +51,21 @@ function bow(out, m, radius, thick, angle, colour, broken) {
   const head = Math.min(5 * thick / radius, size * 0.6), from = Math.PI / 2 - sign * TURN / 2;
   const at = (turn) => {
     const a = from + sign * turn, way = direction(m, [Math.cos(a), Math.sin(a), 0]);
-    return { way, middle: add(middle, way, radius), ways: [way, z.map((v) => -sign * v), way.map((v) => -v), z.map((v) => sign * v)] };
+    return { middle: add(middle, way, radius), ways: [way, z.map((v) => -sign * v), way.map((v) => -v), z.map((v) => sign * v)] };
   };
   const parts = Math.max(3, Math.ceil(STEPS * size / TURN)), dark = colour.map((v) => v * 0.7);
-  let last = at(0);
+  const cap = ({ middle, ways }, inner, outer) => band(out, ring(middle, ways, inner), ring(middle, ways, outer), ways, dark);
+  let last = at(0), begin = ring(last.middle, last.ways, thick);
   for (let k = 1; k <= parts; k++) {
-    const next = at((size - head) * k / parts);
-    const [begin, end] = [ring(last.middle, last.ways, thick), ring(next.middle, next.ways, thick)];
-    if (k === 1 || broken && k % 2) band(out, ring(last.middle, last.ways, 0), begin, last.ways, dark);
-    if (!broken || k % 2) band(out, begin, end, next.ways, colour);
-    if (broken && k % 2 && k < parts) band(out, end, ring(next.middle, next.ways, 0), next.ways, dark);
-    last = next;
+    const next = at((size - head) * k / parts), end = ring(next.middle, next.ways, thick), drawn = !broken || k % 2 === 1;
+    if (drawn && (broken || k === 1)) cap(last, 0, thick);
+    if (drawn) band(out, begin, end, next.ways, colour);
+    if (drawn && broken && k < parts) cap(next, thick, 0);
+    [last, begin] = [next, end];
   }
-  const back = ring(last.middle, last.ways, 2.4 * thick * Math.min(1, 0.4 + size));
-  band(out, ring(last.middle, last.ways, broken && parts % 2 === 0 ? 0 : thick), back, last.ways, dark);
-  band(out, back, ring(at(size).middle, last.ways, 0), last.ways, colour);
+  const wide = 2.4 * thick * Math.min(1, 0.4 + size);
+  cap(last, broken && parts % 2 === 0 ? 0 : thick, wide);
+  band(out, ring(last.middle, last.ways, wide), ring(at(size).middle, last.ways, 0), last.ways, colour);
 }
 
 // A round number that is not smaller.
